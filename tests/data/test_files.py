@@ -220,6 +220,35 @@ def stale(columns):
     columns.update({name: columns[name][held] for name in ("p_x", "p_y")})
 
 
+def late(names, steps):
+    """The columns come some rows after the others."""
+
+    def shift(columns):
+        for name, values in columns.items():
+            kept = slice(0, -steps) if name in names else slice(steps, None)
+            columns[name] = values[kept]
+
+    return shift
+
+
+def back_and_forth(columns):
+    """Half of the run, then the same way in reverse."""
+    rows = np.append(np.arange(151), np.arange(150)[::-1])
+    columns |= {name: columns[name][rows] for name in NAMES[1:]}
+    columns["v"] = np.where(np.arange(301) > 150, -1.0, 1.0) * columns["v"]
+
+
+def unsigned(columns):
+    back_and_forth(columns)
+    columns["v"] = np.abs(columns["v"])
+
+
+def straight(columns):
+    travelled = 0.1 * np.cumsum(columns["v"]) - 0.05 * columns["v"]
+    small = {"yaw": 1e-3 * columns["yaw"], "steering": 1e-3 * columns["steering"]}
+    columns |= small | {"p_x": travelled, "p_y": 0.0 * travelled}
+
+
 WRONG = {
     "nan": (
         change("yaw", 7, np.nan),
@@ -248,6 +277,23 @@ WRONG = {
     "centimetres": (
         lambda c: c.update(p_x=100 * c["p_x"], p_y=100 * c["p_y"]),
         "positions are probably in cm",
+    ),
+    "unsigned": (
+        unsigned,
+        "the robot moves against its yaw at a positive v (14",
+    ),
+    "late positions": (
+        late(("p_x", "p_y"), 3),
+        "the lag of p_x, p_y behind v is 0.3 s (3 steps of vehicle.dt)",
+    ),
+    "late speed": (late("v", 2), "the lag of p_x, p_y behind v is -0.2 s (-2 steps"),
+    "late yaw": (
+        late(("yaw",), 3),
+        "the lag of yaw behind the direction of travel is 0.27 s (2.7 steps",
+    ),
+    "swapped controls": (
+        swap("steering", "acceleration"),
+        "yaw follows acceleration (correlation 1.00), not steering (0.",
     ),
     "yaw and v": (
         swap("yaw", "v"),
@@ -511,6 +557,14 @@ def test_invalid_columns_are_refused(tmp_path, columns, message):
     ("spoil", "options", "message"),
     [
         (scale("steering", np.negative), {}, "the robot turns against steering"),
+        (late(("p_x", "p_y"), 1), {}, "behind v is 0.1 s (1 steps of vehicle.dt)"),
+        (late(NAMES[1:5], 1), {}, "the lag of v behind acceleration is 0.05 s (0.5"),
+        (straight, {}, "yaw turns by 0.014 degrees a second (root"),
+        (
+            straight,
+            {},
+            "steering stays between -0.000229 and 0.000238, and so will the controller",
+        ),
         (scale("steering", np.sign), {}, "steering takes only 2 values"),
         (scale("yaw", lambda yaw: yaw + 1.0), {}, "differ by -1.00 rad throughout"),
         (
@@ -532,6 +586,19 @@ def test_oddities_are_warned_of(tmp_path, spoil, options, message):
     assert any(
         line.startswith(f"warning: {tmp_path}") and message in line for line in lines
     )
+
+
+def test_a_yaw_rate_shows_a_late_yaw_and_driving_backwards_is_right(tmp_path):
+    columns = recorded_run()
+    columns["rate"] = 0.36 * np.cos(0.4 * columns["t"])
+    names = Columns(state=(*STATE, "rate"))
+    late(("yaw",), 2)(columns)
+    line = refusal(write_csv(tmp_path / "a.csv", columns), names)
+    assert "(the first of 2 findings)" in line
+    columns = recorded_run()
+    back_and_forth(columns)
+    _, lines = read(write_csv(tmp_path / "a.csv", columns))
+    assert not [line for line in lines if "against" in line or "the lag of yaw" in line]
 
 
 def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):

@@ -5,6 +5,7 @@ from sfkd_jax.data._dataset import Dataset as Dataset
 from sfkd_jax.data._dataset import check_on_path as check_on_path
 from sfkd_jax.data._dataset import check_shares as check_shares
 from sfkd_jax.data._dataset import coverage as coverage
+from sfkd_jax.data._dataset import environment_box as environment_box
 from sfkd_jax.data._dataset import measure_space as measure_space
 from sfkd_jax.data._dataset import random_windows as random_windows
 from sfkd_jax.data._dataset import split as split
@@ -12,7 +13,6 @@ from sfkd_jax.data._dataset import spread_windows as spread_windows
 from sfkd_jax.data._dataset import to_path as to_path
 from sfkd_jax.data._dataset import windows as windows
 from sfkd_jax.data._from_logs import LoggedDataset as LoggedDataset
-from sfkd_jax.data._from_logs import environment_box as environment_box
 from sfkd_jax.data._from_logs import fingerprint as fingerprint
 from sfkd_jax.data._from_logs import from_logs as from_logs
 from sfkd_jax.data._generation import SCENARIOS as SCENARIOS

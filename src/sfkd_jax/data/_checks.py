@@ -10,7 +10,17 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sfkd_jax.data._logs import Chords, Columns, Log, agreement, find_chords
+from sfkd_jax.data._logs import (
+    FEWEST,
+    LOOK,
+    Chords,
+    Columns,
+    Delay,
+    Log,
+    agreement,
+    find_chords,
+    find_delay,
+)
 from sfkd_jax.data._tables import DROP
 
 Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
@@ -27,8 +37,6 @@ STALE = 0.2
 """Share of driving rows that repeat the position of the row before, from which
 positions count as stale.
 """
-ROUNDED = 1e-5
-"""How far outside its range a channel may be: float32 rounds."""
 AGREE = (0.8, 1.25)
 """Path length over integrated speed of a plausible log."""
 DEGREES = 9e-6
@@ -46,6 +54,8 @@ FACTORS = (
     (DEGREES, "positions are probably degrees of latitude and longitude"),
     (57.29578, "the speed is probably an angular rate, or columns changed places"),
 )
+LATE = 1.5
+"""Steps by which positions or yaw may be late: a model knows the last state alone."""
 CUT_THERE = "; the run is cut there"
 
 
@@ -56,7 +66,7 @@ class Finding(NamedTuple):
     refused: bool = True
 
 
-def _warning(line: str) -> Finding:
+def warning(line: str) -> Finding:
     """A line for which the log is not refused."""
     return Finding(line, refused=False)
 
@@ -85,9 +95,6 @@ class Checks:
             findings += found
             if not any(one.refused for one in found) and _has_rows(log):
                 sound.append(log)
-        if sound:
-            findings += self._steering(sound)
-            findings += self._ranges(sound)
         return sound, findings
 
     def _one(self, log: Log) -> tuple[Log, list[Finding]]:
@@ -118,7 +125,7 @@ class Checks:
         longest = max(float(np.ptp(part)) for part in np.split(log.time, edges))
         if longest < (self.steps - 1e-3) * self.dt:
             needed = f"a segment is {self.steps * self.dt:.4g} s; not used"
-            found.append(_warning(f"{log.whole}: only {longest:.4g} s, {needed}"))
+            found.append(warning(f"{log.whole}: only {longest:.4g} s, {needed}"))
         if not _has_rows(log):
             return log, found
         found += (units := list(self._units(log)))
@@ -126,6 +133,7 @@ class Checks:
         if not any(one.refused for one in units):
             found += self._sampling(log)
             found += self._motion(log)
+            found += self._delays(log)
         return log, found
 
     def _drop_missing_rows(self, log: Log) -> tuple[Log, list[Finding]]:
@@ -223,6 +231,78 @@ class Checks:
         for find in (self._position_jumps, self._yaw_jumps):
             yield from _first(log, *find(log))
 
+    def _reversals(self, log: Log, chords: Chords) -> Iterator[Finding]:
+        """A stretch in reverse at a speed without a sign, among others ahead."""
+        off = np.abs(np.angle(np.exp(1j * (chords.course - chords.yaw))))
+        opposite = np.zeros(len(log.time), dtype=bool)
+        opposite[chords.middle[off > np.pi - 0.5]] = True
+        # A single jump turns as many chords as there are over it.
+        least = round(2 * LOOK / log.period)
+        for rows in np.split(
+            np.arange(len(opposite)), np.flatnonzero(np.diff(opposite)) + 1
+        ):
+            if opposite[rows[0]] and len(rows) > least and (off < 0.5).sum() > least:
+                yield Finding(
+                    f"{log.between(int(rows[0]), int(rows[-1]))}: the robot moves "
+                    f"against its yaw at a positive {self.columns.state[3]}"
+                    f"{more(opposite)}; make it negative where the robot reverses"
+                )
+                return
+
+    def _delays(self, log: Log) -> Iterator[Finding]:
+        """Positions and yaw that are late against speed, yaw rate and course."""
+        if not log.joined.any() or _stale(log).any():
+            return
+        x, y, yaw, speed = self.columns.state[:4]
+        parts, yaws = log.parts(self.gap, self.dt), np.unwrap(log.states[:, 2])
+
+        def delay(*columns: Float[np.ndarray, "time ..."]) -> Delay:
+            table = np.column_stack([log.time, *columns])
+            return find_delay(table[rows] for rows in parts)
+
+        found = {
+            (f"{x}, {y}", speed): delay(log.states[:, :2], log.states[:, 3]),
+            (yaw, "the direction of travel"): self._behind_course(log),
+        }
+        for k, name in enumerate(self.columns.state[4:], start=4):
+            rated = delay(yaws, log.states[:, k])
+            # Whatever else its unit, this column is the yaw rate.
+            if rated.alike > 0.95 and 0.8 < abs(rated.gain) < 1.25:
+                found[yaw, name] = rated
+        for (late, early), one in found.items():
+            size = max(0.9 * log.period, 0.1 * self.dt)
+            if one.certain and one.alike > 0.7 and abs(one.lag) >= size:
+                yield Finding(
+                    f"{log.whole}: {one.line(late, early, self.dt)}",
+                    refused=abs(one.lag) >= LATE * self.dt,
+                )
+
+    def _behind_course(self, log: Log) -> Delay:
+        """How late yaw is, of how its angle to the course follows the yaw rate.
+
+        A position ahead of the rear axle turns the course by its distance times yaw
+        rate over speed. That distance is fitted too, about half a wheelbase.
+        """
+        chords = find_chords(log, log.states[:, 3])
+        speed = log.states[chords.middle, 3]
+        count = len(speed) * log.period / LOOK
+        moves = np.abs(speed) > 0.0
+        if count < 0.5 * FEWEST or not moves.all() or np.std(chords.turn) < 1e-3:
+            return Delay()
+        off = chords.course - chords.yaw
+        off = np.angle(np.exp(1j * (off - np.angle(agreement(off)))))
+        causes = np.column_stack([np.ones_like(off), chords.turn, chords.turn / speed])
+        rest = off - causes @ np.linalg.lstsq(causes, off, rcond=None)[0]
+        # Neighbouring chords overlap: as many count as fit one after another.
+        weight = count / len(off) / max(float(np.mean(rest**2)), 1e-12)
+        prior = np.array([1e-9, 1e-9, 16.0 / self.wheelbase**2])
+        inverse = np.linalg.inv(weight * causes.T @ causes + np.diag(prior))
+        mean = inverse @ (weight * causes.T @ off + prior * 0.5 * self.wheelbase)
+        lag, spread = float(mean[1]), float(np.sqrt(inverse[1, 1]))
+        alike = np.sqrt(max(0.0, 1.0 - np.mean(rest**2) / max(np.var(off), 1e-12)))
+        # Tyres that slip make yaw look early.
+        return Delay(lag, float(alike), certain=lag > 5.0 * spread)
+
     def _position_jumps(
         self, log: Log
     ) -> tuple[Bool[np.ndarray, " step"], Callable[[int], str]]:
@@ -256,7 +336,7 @@ class Checks:
         speed, chords = self.columns.state[3], find_chords(log, log.states[:, 3])
         moved, integrated = chords.length.sum(), np.abs(chords.integrated).sum()
         if moved == 0.0 and integrated == 0.0:
-            yield _warning(f"{log.whole}: neither position nor {speed} ever moves")
+            yield warning(f"{log.whole}: neither position nor {speed} ever moves")
         elif moved == 0.0 or integrated == 0.0:
             names = ("the position", speed)
             still, goes = names if moved == 0.0 else names[::-1]
@@ -292,9 +372,11 @@ class Checks:
     def _heading(self, log: Log, chords: Chords) -> Iterator[Finding]:
         """Yaw against the direction of travel, with a likely cause."""
         x, y, name, speed = self.columns.state[:4]
-        yaw = log.states[chords.middle, 2]
+        yaw = chords.yaw
         agreed = agreement(chords.course - yaw)
+        reverses = list(self._reversals(log, chords))
         if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
+            yield from reverses
             return
         compass = f"{name} is probably a compass heading"
         # What yaw may be instead, and the yaw that follows.
@@ -319,77 +401,18 @@ class Checks:
         off = f"{log.whole}: {name} and the direction of travel differ"
         if fit > 0.9:
             yield Finding(f"{off}; {best}")
+        elif reverses:
+            yield from reverses
         elif abs(agreed) > 0.7:
-            yield _warning(
+            yield warning(
                 f"{off} by {np.angle(agreed):.2f} rad throughout; "
                 "is the sensor mounted askew?"
             )
         else:
-            yield _warning(
+            yield warning(
                 f"{off} at random; a robot that drives sideways, "
                 "or columns that changed places?"
             )
-
-    def _steering(self, logs: list[Log]) -> Iterator[Finding]:
-        """Yaw rates against a bicycle's, ω = v tan δ / L: sign, unit and L."""
-        expected, turned = (
-            np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
-        )
-        power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
-        alike = float(np.mean(expected * turned)) / power if power else 0.0
-        # Not a steering angle, or too little steering to tell.
-        if abs(alike) < 0.6:
-            return
-        fits = float(np.mean(expected**2) / np.mean(expected * turned))
-        name, where = self.columns.control[0], _span(logs)
-        if alike < 0:
-            yield _warning(
-                f"{where}: the robot turns against {name}; "
-                "a positive one should turn it left"
-            )
-        elif not 0.6 < fits / self.wheelbase < 1.7:
-            unit = f" or {name} is not in rad" if fits > 10 * self.wheelbase else ""
-            yield _warning(
-                f"{where}: {name} and yaw suggest a wheelbase of {fits:.3g} m, "
-                f"vehicle.wheelbase is {self.wheelbase:g}{unit}"
-            )
-
-    def _ranges(self, logs: list[Log]) -> Iterator[Finding]:
-        """Controls that hardly vary or leave their limits; environments outside E."""
-        where, columns = _span(logs), self.columns
-        for k, name in enumerate(columns.control):
-            values = np.concatenate([log.controls[:, k] for log in logs])
-            kinds = len(np.unique(values))
-            if np.ptp(values) <= 1e-9 * max(1.0, float(np.abs(values).max())):
-                yield Finding(
-                    f"{where}: {name} is always {values[0]:.4g}; "
-                    "without excitation nothing can be learned of it"
-                )
-            elif kinds < 5:
-                yield _warning(
-                    f"{where}: {name} takes only {kinds} values; vary it more"
-                )
-        low, high = self.limits
-        if low and high:
-            found = _outside(logs, "controls", columns.control, low, high)
-            limits = "of vehicle.control_low and vehicle.control_high"
-            yield from (_warning(f"{line} {limits}") for line in found)
-        low, high = self.box
-        if low is None and high is None:
-            return
-        size = logs[0].envs.shape[1]
-        low, high = low or (), high or ()
-        if {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
-            yield Finding(
-                f"environment.low and environment.high must be {size} numbers each, "
-                "the low ones not above the high"
-            )
-            return
-        names = columns.environment
-        names = names if len(names) == size else ("environment",) * size
-        found = _outside(logs, "envs", names, low, high)
-        box = "of environment.low and environment.high"
-        yield from (Finding(f"{line} {box}") for line in found)
 
 
 def _has_rows(log: Log) -> bool:
@@ -417,10 +440,10 @@ def _first(
     if bad.any():
         k = int(bad.argmax())
         row = k + len(log.time) - len(bad)
-        yield Finding(f"{log.at(row)}: {text(k)}{_more(bad)}{hint}", refused)
+        yield Finding(f"{log.at(row)}: {text(k)}{more(bad)}{hint}", refused)
 
 
-def _more(bad: Bool[np.ndarray, " row"]) -> str:
+def more(bad: Bool[np.ndarray, " row"]) -> str:
     """How many rows there are like the first."""
     return f" ({bad.sum()} rows like this)" if bad.sum() > 1 else ""
 
@@ -437,40 +460,3 @@ def _stale(log: Log) -> Bool[np.ndarray, " step"]:
     driving = (log.integrated > 0.1 * usual) & log.joined
     stale = driving & (log.moved == 0.0)
     return stale & (stale.sum() > STALE * max(driving.sum(), 1))
-
-
-def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
-    """v tan δ and the yaw rate of every step; large controls are taken as tan δ."""
-    steering = log.controls[:-1, 0]
-    # More than 80° is no angle of a wheel, but may be a turn command.
-    angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
-    turned = np.diff(np.unwrap(log.states[:, 2]))[log.joined] / log.waits[log.joined]
-    return (log.states[:-1, 3] * angle)[log.joined], turned
-
-
-def _span(logs: list[Log]) -> str:
-    """The position of several runs, for messages."""
-    more = f" and {len(logs) - 1} runs more" if logs[1:] else ""
-    return logs[0].whole + more
-
-
-def _outside(
-    logs: list[Log],
-    field: str,
-    names: tuple[str, ...],
-    low: tuple[float, ...],
-    high: tuple[float, ...],
-) -> Iterator[str]:
-    """A line about the first row of every channel that is outside its range."""
-    for k, (name, least, most) in enumerate(zip(names, low, high, strict=True)):
-        slack = ROUNDED * max(1.0, abs(least), abs(most))
-        for log in logs:
-            channel = getattr(log, field)[:, k]
-            outside = (channel < least - slack) | (channel > most + slack)
-            if outside.any():
-                first = int(outside.argmax())
-                yield (
-                    f"{log.at(first)}: {name} is {channel[first]:.4g}{_more(outside)}, "
-                    f"outside the range from {least:g} to {most:g}"
-                )
-                break

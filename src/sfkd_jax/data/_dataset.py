@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sfkd_jax.data._logs import Log
 from sfkd_jax.geometry import PathFeedback, between, is_valid, path_state, wrap_angle
 from sfkd_jax.scenarios import Path, point_at, project
 from sfkd_jax.types import BODY, POSE, Key, Scalar, Space, State, Trajectory
@@ -43,6 +44,10 @@ class Dataset(NamedTuple):
 
 PARTS = Dataset._fields[:4]
 """Names of the parts of a data set."""
+UNBOUNDED = 1e6
+"""Half width of E where nobody measured the environment and no model reads it."""
+SAME_MOMENT = 1e-5
+"""Rows within this share of a period of a moment are taken without interpolation."""
 ATTEMPTS = 200
 """Orders of the runs that are tried before runs are cut."""
 TOLERANCE = 2.0
@@ -118,6 +123,111 @@ def split(
         }
     corners = {"env_low": jnp.asarray(env_low), "env_high": jnp.asarray(env_high)}
     return Dataset(*parts, **corners, scenarios=labels)
+
+
+def environment_box(
+    envs: Float[Array, "*batch environment"] | Float[np.ndarray, "*batch environment"],
+    low: Sequence[float] | None = None,
+    high: Sequence[float] | None = None,
+    *,
+    known: bool,
+) -> tuple[Float[Array, " environment"], Float[Array, " environment"]]:
+    """Return the corners of E: as given, or as far as the environments reach.
+
+    Args:
+        envs: of all segments.
+        low: lower corner, or None.
+        high: upper corner, or None.
+        known: whether somebody measured them; E is wide otherwise.
+    """
+    values = np.asarray(envs).reshape(-1, np.shape(envs)[-1])
+    corners: Iterable[Any] = (low, high)
+    if low is None or high is None:
+        wide = np.full(values.shape[1], UNBOUNDED)
+        # Not by the values: a slope that is 0 throughout was measured to be 0.
+        corners = (values.min(axis=0), values.max(axis=0)) if known else (-wide, wide)
+    lower, upper = (jnp.asarray(corner, dtype=jnp.float32) for corner in corners)
+    return lower, upper
+
+
+class Piece(NamedTuple):
+    """Evenly sampled steps without a gap, or a stack of as long ones.
+
+    Attributes:
+        states: at every moment.
+        controls: at every moment but the last.
+        envs: at every moment but the last.
+    """
+
+    states: Float[np.ndarray, "*segment steps_plus_1 state"]
+    controls: Float[np.ndarray, "*segment steps control"]
+    envs: Float[np.ndarray, "*segment steps environment"]
+
+
+def pieces(log: Log, dt: float, gap: float) -> Iterator[Piece]:
+    """Split a run at its gaps and cuts, and sample each piece at 0, dt, 2 dt, ….
+
+    States are interpolated linearly, yaw after unwrapping; environments are held from
+    the row before (zero order), controls averaged over the step as they were held.
+    """
+    for rows in log.parts(gap, dt):
+        time, states = log.time[rows] - log.time[rows[0]], log.states[rows]
+        moments = dt * np.arange(int(time[-1] / dt + SAME_MOMENT) + 1)
+        nearest = time[np.searchsorted(0.5 * (time[1:] + time[:-1]), moments)]
+        # Rows at these moments are kept exactly.
+        same = np.abs(nearest - moments) < SAME_MOMENT * dt
+        moments = np.where(same, nearest, moments)
+        # Interpolated through a wrap, yaw would turn by 2π between two rows.
+        states[:, 2] = np.unwrap(states[:, 2])
+        sampled = [np.interp(moments, time, channel) for channel in states.T]
+        # Of the row before: a later one was not yet known to the robot.
+        held = np.searchsorted(time, moments[:-1], side="right") - 1
+        last = np.searchsorted(time, moments[1:], side="left") - 1
+        # Rows jitter around the moments, and the robot follows a command from its row.
+        commands = log.controls[rows]
+        given = np.cumsum(np.diff(time)[:, None] * commands[:-1], axis=0)
+        given = np.concatenate([np.zeros((1, commands.shape[1])), given])
+        given = np.column_stack([np.interp(moments, time, total) for total in given.T])
+        mean = np.diff(given, axis=0) / np.diff(moments)[:, None]
+        # One that did not change is kept to the last bit.
+        controls = np.where((held == last)[:, None], commands[held], mean)
+        yield Piece(np.column_stack(sampled), controls, log.envs[rows[held]])
+
+
+def segments(
+    pieces: list[list[Piece]], steps: int
+) -> tuple[Piece, Int[np.ndarray, " segment"]]:
+    """Cut the pieces of every run end to end; the rest of a piece is dropped.
+
+    Positions are relative to the first of a segment, and its yaw begins in (−π, π]:
+    float32 cannot resolve positions on Earth.
+
+    Returns:
+        The segments in the order of time, and the number of the run of each.
+
+    Raises:
+        ValueError: no piece is as long as a segment.
+    """
+    cut: list[Piece] = []
+    runs: list[int] = []
+    for run, piece in ((k, piece) for k, parts in enumerate(pieces) for piece in parts):
+        for start in range(0, len(piece.controls) - steps + 1, steps):
+            stop = start + steps
+            states = piece.states[start : stop + 1].copy()
+            states[:, :2] -= states[0, :2]
+            turns = np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
+            states[:, 2] -= 2.0 * np.pi * turns
+            cut.append(
+                Piece(states, piece.controls[start:stop], piece.envs[start:stop])
+            )
+            runs.append(run)
+    if not cut:
+        lengths = (len(piece.controls) for parts in pieces for piece in parts)
+        raise ValueError(
+            f"the longest run without a gap has {max(lengths, default=0)} steps, "
+            f"a segment {steps}; pass dataset.steps"
+        )
+    return Piece(*map(np.stack, zip(*cut, strict=True))), np.array(runs)
 
 
 def assign_parts(

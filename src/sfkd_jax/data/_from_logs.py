@@ -4,34 +4,42 @@ from __future__ import annotations
 
 import glob
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sfkd_jax.data._checks import Bounds, Checks, Finding
-from sfkd_jax.data._dataset import PARTS, Dataset, assign_parts, coverage
-from sfkd_jax.data._logs import Columns, Log, read_logs
+from sfkd_jax.data._checks import Bounds, Checks, Finding, more, warning
+from sfkd_jax.data._dataset import (
+    PARTS,
+    Dataset,
+    assign_parts,
+    coverage,
+    environment_box,
+    pieces,
+    segments,
+)
+from sfkd_jax.data._logs import Columns, Delay, Log, find_chords, find_delay, read_logs
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
 from sfkd_jax.store import open_regular
 from sfkd_jax.types import BODY, Trajectory
 
 SUFFIXES = (".csv", ".npz", ".parquet")
-UNBOUNDED = 1e6
-"""Half width of E where nobody measured the environment and no model reads it."""
 MOST_LINES = 20
 """Warnings that are reported in full; of more, only their number."""
+ROUNDED = 1e-5
+"""How far outside its range a channel may be: float32 rounds."""
+STRAIGHT, TINY = 1.0, 0.01
+"""Yaw rate [degrees/s] and range of a control below which a log teaches too little."""
 ALIKE = 1e-3
 """Of a channel's standard deviation: to this step numbers are rounded and compared."""
 IN_A_ROW = 10
 """Steps that are compared at once: single ones are alike by chance."""
-SAME_MOMENT = 1e-5
-"""Rows within this share of a period of a moment are taken without interpolation."""
 
 
 class LoggedDataset(NamedTuple):
@@ -44,20 +52,6 @@ class LoggedDataset(NamedTuple):
 
     dataset: Dataset
     coverage: dict[str, dict[str, dict[str, float]]]
-
-
-class Piece(NamedTuple):
-    """Evenly sampled steps without a gap, or a stack of as long ones.
-
-    Attributes:
-        states: at every moment.
-        controls: at every moment but the last.
-        envs: at every moment but the last.
-    """
-
-    states: Float[np.ndarray, "*segment steps_plus_1 state"]
-    controls: Float[np.ndarray, "*segment steps control"]
-    envs: Float[np.ndarray, "*segment steps environment"]
 
 
 def from_logs(
@@ -121,9 +115,11 @@ def from_logs(
     cuts = (gap, min_speed, split_at_jumps, drop)
     checks = Checks(columns, dt, steps, wheelbase, *cuts, limits, box)
     logs, findings = checks.apply(recorded)
-    findings += _repeats(logs, steps * dt)
+    if logs:
+        for check in (_steering, _ranges, _commands, _repeats):
+            findings += check(checks, logs)
     _report_findings([*map(Finding, errors), *findings], report)
-    cut, runs = _segments([list(_pieces(log, dt, gap)) for log in logs], steps)
+    cut, runs = segments([list(pieces(log, dt, gap)) for log in logs], steps)
     parts, whole = assign_parts(runs, shares=shares, seed=seed)
     waits = np.concatenate([log.waits[log.joined] for log in logs])
     seconds = float(waits.sum())
@@ -167,13 +163,11 @@ def from_logs(
     return LoggedDataset(dataset, covered)
 
 
-def _repeats(logs: list[Log], shortest: float) -> Iterator[Finding]:
-    """Stretches that two runs have in common, from a length in seconds on.
+def _repeats(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
+    """Stretches as long as a segment that two runs have in common.
 
     Their numbers are compared: a copy may have another format, clock and origin.
     """
-    if not logs:
-        return
     spread = np.std(np.concatenate([log.steps for log in logs]), axis=0)
     scale = ALIKE * np.where(spread > 0.0, spread, 1.0)
     found = [_marks(log, scale) for log in logs]
@@ -184,7 +178,7 @@ def _repeats(logs: list[Log], shortest: float) -> Iterator[Finding]:
     pairs = np.column_stack([owners[origins], owners])
     for one, other in np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0):
         copies = np.flatnonzero((pairs == (one, other)).all(axis=1))
-        if (len(copies) + IN_A_ROW) * logs[other].period < shortest:
+        if (len(copies) + IN_A_ROW) * logs[other].period < checks.steps * checks.dt:
             continue
         here, there = (
             log.between(int(places.min()), int(places.max()) + IN_A_ROW)
@@ -214,6 +208,152 @@ def _marks(
     kept &= sliding_window_view(log.joined, IN_A_ROW).all(axis=-1)
     several = sliding_window_view(words, IN_A_ROW, axis=0)
     return np.einsum("kcs,cs->k", several, weights)[kept], np.flatnonzero(kept)
+
+
+def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
+    """Yaw rates against a bicycle's, ω = v tan δ / L: sign, unit and L."""
+    expected, turned = (
+        np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
+    )
+    power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
+    alike = float(np.mean(expected * turned)) / power if power else 0.0
+    # Not a steering angle, or too little steering to tell.
+    if abs(alike) < 0.6:
+        return
+    fits = float(np.mean(expected**2) / np.mean(expected * turned))
+    name, where = checks.columns.control[0], _span(logs)
+    if alike < 0:
+        yield warning(
+            f"{where}: the robot turns against {name}; "
+            "a positive one should turn it left"
+        )
+    elif not 0.6 < fits / checks.wheelbase < 1.7:
+        unit = f" or {name} is not in rad" if fits > 10 * checks.wheelbase else ""
+        yield warning(
+            f"{where}: {name} and yaw suggest a wheelbase of {fits:.3g} m, "
+            f"vehicle.wheelbase is {checks.wheelbase:g}{unit}"
+        )
+
+
+def _ranges(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
+    """Controls that hardly vary or leave their limits; environments outside E."""
+    where, columns = _span(logs), checks.columns
+    for k, name in enumerate(columns.control):
+        values = np.concatenate([log.controls[:, k] for log in logs])
+        kinds = len(np.unique(values))
+        if np.ptp(values) <= 1e-9 * max(1.0, float(np.abs(values).max())):
+            yield Finding(
+                f"{where}: {name} is always {values[0]:.4g}; "
+                "without excitation nothing can be learned of it"
+            )
+        elif kinds < 5:
+            yield warning(f"{where}: {name} takes only {kinds} values; vary it more")
+    low, high = checks.limits
+    if low and high:
+        found = _outside(logs, "controls", columns.control, low, high)
+        limits = "of vehicle.control_low and vehicle.control_high"
+        yield from (warning(f"{line} {limits}") for line in found)
+    low, high = checks.box
+    if low is None and high is None:
+        return
+    size = logs[0].envs.shape[1]
+    low, high = low or (), high or ()
+    if {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
+        yield Finding(
+            f"environment.low and environment.high must be {size} numbers each, "
+            "the low ones not above the high"
+        )
+        return
+    names = columns.environment
+    names = names if len(names) == size else ("environment",) * size
+    found = _outside(logs, "envs", names, low, high)
+    box = "of environment.low and environment.high"
+    yield from (Finding(f"{line} {box}") for line in found)
+
+
+def _outside(
+    logs: list[Log],
+    field: str,
+    names: tuple[str, ...],
+    low: tuple[float, ...],
+    high: tuple[float, ...],
+) -> Iterator[str]:
+    """A line about the first row of every channel that is outside its range."""
+    for k, (name, least, most) in enumerate(zip(names, low, high, strict=True)):
+        slack = ROUNDED * max(1.0, abs(least), abs(most))
+        for log in logs:
+            channel = getattr(log, field)[:, k]
+            outside = (channel < least - slack) | (channel > most + slack)
+            if outside.any():
+                first = int(outside.argmax())
+                yield (
+                    f"{log.at(first)}: {name} is {channel[first]:.4g}{more(outside)}, "
+                    f"outside the range from {least:g} to {most:g}"
+                )
+                break
+
+
+def _span(logs: list[Log]) -> str:
+    """The position of several runs, for messages."""
+    more = f" and {len(logs) - 1} runs more" if logs[1:] else ""
+    return logs[0].whole + more
+
+
+def _commands(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
+    """Motion against commands: columns that changed places, delays, no excitation."""
+    yaw, speed, controls = *checks.columns.state[2:4], checks.columns.control
+
+    def answer(chosen: list[Log], state: int, control: int) -> Delay:
+        """The delay of yaw or speed behind a command; a turn is faster at speed."""
+        tables = []
+        for log in chosen:
+            rate = log.controls[:, control] * log.states[:, 3] ** (state == 2)
+            motion = np.unwrap(log.states[:, state]) if state == 2 else log.states[:, 3]
+            table = np.column_stack([log.time, motion, rate])
+            tables += [table[rows] for rows in log.parts(checks.gap, checks.dt)]
+        return find_delay(tables, held=True)
+
+    for log in logs:
+        turns, pushes = ([answer([log], k, n).alike for n in (0, 1)] for k in (2, 3))
+        swapped = turns[1] > 0.8 or (pushes[0] > 0.8 and pushes[1] < 0.4)
+        if turns[0] < 0.4 and swapped:
+            yield Finding(
+                f"{log.whole}: {yaw} follows {controls[1]} (correlation "
+                f"{turns[1]:.2f}), not {controls[0]} ({turns[0]:.2f}); "
+                "have columns changed places?"
+            )
+    for state, name, control in ((2, yaw, 0), (3, speed, 1)):
+        found = answer(logs, state, control)
+        steps = found.lag / checks.dt
+        # Half a step early: a command that was measured, or interpolated.
+        if found.certain and found.alike > 0.8 and (steps < -1.0 or steps > 0.25):
+            yield warning(
+                f"{_span(logs)}: {found.line(name, controls[control], checks.dt)}, "
+                "unless a state shows the delay"
+            )
+    turn = np.concatenate([find_chords(log, log.states[:, 3]).turn for log in logs])
+    if turn.size and (rate := np.rad2deg(np.sqrt(np.mean(turn**2)))) < STRAIGHT:
+        yield warning(
+            f"{_span(logs)}: {yaw} turns by {rate:.2g} degrees a second (root mean "
+            "square); record curves, or the model learns none"
+        )
+    for k, name in enumerate(controls):
+        values = np.concatenate([log.controls[:, k] for log in logs])
+        low, high = np.quantile(values, [0.001, 0.999])
+        if 0.0 < high - low < TINY:
+            yield warning(
+                f"{_span(logs)}: {name} stays between {low:.3g} and {high:.3g}, and so "
+                "will the controller; vary it more, or set vehicle.control_low and high"
+            )
+
+
+def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
+    """v tan δ and the yaw rate of every step; large controls are taken as tan δ."""
+    steering = log.controls[:-1, 0]
+    # More than 80° is no angle of a wheel, but may be a turn command.
+    angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
+    turned = np.diff(np.unwrap(log.states[:, 2]))[log.joined] / log.waits[log.joined]
+    return (log.states[:-1, 3] * angle)[log.joined], turned
 
 
 def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> None:
@@ -286,98 +426,6 @@ def _digest(file: Path, size: int, written: int) -> str:
     del size, written  # part of the key of the cache
     with open_regular(file) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
-
-
-def environment_box(
-    envs: Float[Array, "*batch environment"] | Float[np.ndarray, "*batch environment"],
-    low: Sequence[float] | None = None,
-    high: Sequence[float] | None = None,
-    *,
-    known: bool,
-) -> tuple[Float[Array, " environment"], Float[Array, " environment"]]:
-    """Return the corners of E: as given, or as far as the environments reach.
-
-    Args:
-        envs: of all segments.
-        low: lower corner, or None.
-        high: upper corner, or None.
-        known: whether somebody measured them; E is wide otherwise.
-    """
-    values = np.asarray(envs).reshape(-1, np.shape(envs)[-1])
-    corners: Iterable[Any] = (low, high)
-    if low is None or high is None:
-        wide = np.full(values.shape[1], UNBOUNDED)
-        # Not by the values: a slope that is 0 throughout was measured to be 0.
-        corners = (values.min(axis=0), values.max(axis=0)) if known else (-wide, wide)
-    lower, upper = (jnp.asarray(corner, dtype=jnp.float32) for corner in corners)
-    return lower, upper
-
-
-def _pieces(log: Log, dt: float, gap: float) -> Iterator[Piece]:
-    """Split a run at its gaps and cuts, and sample each piece at 0, dt, 2 dt, ….
-
-    States are interpolated linearly, yaw after unwrapping; environments are held from
-    the row before (zero order), controls averaged over the step as they were held.
-    """
-    edges = np.flatnonzero(log.gaps(gap, dt) | ~log.joined) + 1
-    for rows in np.split(np.arange(len(log.time)), edges):
-        time, states = log.time[rows] - log.time[rows[0]], log.states[rows]
-        moments = dt * np.arange(int(time[-1] / dt + SAME_MOMENT) + 1)
-        nearest = time[np.searchsorted(0.5 * (time[1:] + time[:-1]), moments)]
-        # Rows at these moments are kept exactly.
-        same = np.abs(nearest - moments) < SAME_MOMENT * dt
-        moments = np.where(same, nearest, moments)
-        # Interpolated through a wrap, yaw would turn by 2π between two rows.
-        states[:, 2] = np.unwrap(states[:, 2])
-        sampled = [np.interp(moments, time, channel) for channel in states.T]
-        # Of the row before: a later one was not yet known to the robot.
-        held = np.searchsorted(time, moments[:-1], side="right") - 1
-        last = np.searchsorted(time, moments[1:], side="left") - 1
-        # Rows jitter around the moments, and the robot follows a command from its row.
-        commands = log.controls[rows]
-        given = np.cumsum(np.diff(time)[:, None] * commands[:-1], axis=0)
-        given = np.concatenate([np.zeros((1, commands.shape[1])), given])
-        given = np.column_stack([np.interp(moments, time, total) for total in given.T])
-        mean = np.diff(given, axis=0) / np.diff(moments)[:, None]
-        # One that did not change is kept to the last bit.
-        controls = np.where((held == last)[:, None], commands[held], mean)
-        yield Piece(np.column_stack(sampled), controls, log.envs[rows[held]])
-
-
-def _segments(
-    pieces: list[list[Piece]], steps: int
-) -> tuple[Piece, Int[np.ndarray, " segment"]]:
-    """Cut the pieces of every run end to end; the rest of a piece is dropped.
-
-    Positions are relative to the first of a segment, and its yaw begins in (−π, π]:
-    float32 cannot resolve positions on Earth.
-
-    Returns:
-        The segments in the order of time, and the number of the run of each.
-
-    Raises:
-        ValueError: no piece is as long as a segment.
-    """
-    cut: list[Piece] = []
-    runs: list[int] = []
-    for run, piece in ((k, piece) for k, parts in enumerate(pieces) for piece in parts):
-        for start in range(0, len(piece.controls) - steps + 1, steps):
-            stop = start + steps
-            states = piece.states[start : stop + 1].copy()
-            states[:, :2] -= states[0, :2]
-            turns = np.ceil((states[0, 2] - np.pi) / (2.0 * np.pi))
-            states[:, 2] -= 2.0 * np.pi * turns
-            cut.append(
-                Piece(states, piece.controls[start:stop], piece.envs[start:stop])
-            )
-            runs.append(run)
-    if not cut:
-        lengths = (len(piece.controls) for parts in pieces for piece in parts)
-        raise ValueError(
-            f"the longest run without a gap has {max(lengths, default=0)} steps, "
-            f"a segment {steps}; pass dataset.steps"
-        )
-    return Piece(*map(np.stack, zip(*cut, strict=True))), np.array(runs)
 
 
 def _coverage_lines(

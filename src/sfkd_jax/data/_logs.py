@@ -28,6 +28,8 @@ DIMENSIONS = ("length", "length", "angle", "speed")
 """Of the first states."""
 LOOK = 0.5
 """Length of the chords over which motion is compared with the columns [s]."""
+LATEST, LAGS, FEWEST = 1.0, 401, 20
+"""Largest delay that is looked for [s], how many are, and chords that it takes."""
 RUN = "number of the run"
 """Column of tables of arrays x, u, e."""
 
@@ -138,6 +140,11 @@ class Log:
         """
         return (self.waits > gap * max(self.period, dt)) & self.joined
 
+    def parts(self, gap: float, dt: float) -> list[Int[np.ndarray, " time"]]:
+        """Return the rows between gaps and cuts; `gaps` has the arguments."""
+        edges = np.flatnonzero(self.gaps(gap, dt) | ~self.joined) + 1
+        return np.split(np.arange(len(self.time)), edges)
+
     def channels(self, columns: Columns) -> dict[str, Float[np.ndarray, " time"]]:
         """Return every column by its name, less an unknown environment."""
         named = {columns.time: self.time}
@@ -172,12 +179,16 @@ class Chords(NamedTuple):
         length: of the chord [m].
         integrated: ∫ v dt [m].
         course: direction of the chord, reversed where v < 0 [rad].
+        yaw: in the middle of the chord [rad].
+        turn: yaw rate along the chord [rad/s].
         middle: index of the row in the middle.
     """
 
     length: Float[np.ndarray, " chord"]
     integrated: Float[np.ndarray, " chord"]
     course: Float[np.ndarray, " chord"]
+    yaw: Float[np.ndarray, " chord"]
+    turn: Float[np.ndarray, " chord"]
     middle: Int[np.ndarray, " chord"]
 
 
@@ -198,8 +209,82 @@ def find_chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
         moving |= distance > 0.2 * np.max(distance, where=whole, initial=0.0)
     moving &= whole
     course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
-    middle = np.flatnonzero(moving) + reach // 2
-    return Chords(length[moving], integrated[moving], course[moving], middle)
+    yaw, first = np.unwrap(log.states[:, 2]), np.flatnonzero(moving)
+    # An odd number of steps has no row in its middle.
+    middle, after = first + reach // 2, first + (reach + 1) // 2
+    return Chords(
+        length[moving],
+        integrated[moving],
+        course[moving],
+        0.5 * (yaw[middle] + yaw[after]),
+        (yaw[first + reach] - yaw[first]) / lasted[moving],
+        middle,
+    )
+
+
+class Delay(NamedTuple):
+    """How much later a motion comes than the rate that should be its derivative.
+
+    Attributes:
+        lag: at which they agree best [s]; negative if the motion comes first.
+        alike: absolute correlation at that lag.
+        gain: of the motion over the integrated rate.
+        certain: whether a lag of zero agrees worse, beyond chance.
+    """
+
+    lag: float = 0.0
+    alike: float = 0.0
+    gain: float = 0.0
+    certain: bool = False
+
+    def line(self, late: str, early: str, dt: float) -> str:
+        """Return what is said of it, in periods dt of the model."""
+        return (
+            f"the lag of {late} behind {early} is {self.lag:.2g} s "
+            f"({self.lag / dt:.2g} steps of vehicle.dt); shift one of them in time"
+        )
+
+
+def find_delay(
+    tables: Iterable[Float[np.ndarray, "_ column"]], *, held: bool = False
+) -> Delay:
+    """Find the delay of a motion behind a rate by correlation over chords of `LOOK`.
+
+    Args:
+        tables: time [s], motion (of two columns: a position) and rate (of a position: a
+            speed) of uninterrupted stretches.
+        held: whether the rate holds from its row on, as a command does.
+    """
+    lags = np.linspace(-LATEST, LATEST, LAGS)
+    motion, summed = [np.zeros(0)], [np.zeros((LAGS, 0))]
+    for time, *moved, rate in (table.T for table in tables):
+        between = rate[:-1] if held else 0.5 * (rate[1:] + rate[:-1])
+        along = np.append(0.0, np.cumsum(between * np.diff(time)))
+        starts = np.arange(time[0] + LATEST, time[-1] - LATEST - LOOK, 0.5 * LOOK)
+        ends = np.stack([starts, starts + LOOK])
+        summed.append(
+            np.diff(np.interp(ends[:, None] - lags[:, None], time, along), axis=0)[0]
+        )
+        chords = [np.diff(np.interp(ends, time, one), axis=0)[0] for one in moved]
+        if chords[1:]:  # a distance has no sign of its own
+            chords = [np.sign(summed[-1][LAGS // 2]) * np.hypot(*chords)]
+        motion += chords
+    seen, expected = np.concatenate(motion), np.concatenate(summed, axis=1)
+    if (count := len(seen)) < FEWEST:
+        return Delay()
+    seen, expected = seen - seen.mean(), expected - expected.mean(axis=1, keepdims=True)
+    power = np.sum(expected**2, axis=1)
+    if not (seen.any() and power.min() > 0.0):
+        return Delay()
+    gains = expected @ seen / power
+    fit = gains**2 * power / np.sum(seen**2)
+    best = int(fit.argmax())
+    # The log of a likelihood ratio: every other chord overlaps its neighbours.
+    ratio = (1.0 - fit[LAGS // 2] + 1e-9) / (1.0 - fit[best] + 1e-9)
+    certain = bool(0.25 * count * np.log(ratio) > 10.0)
+    return Delay(
+        float(lags[best]), float(np.sqrt(fit[best])), float(gains[best]), certain
+    )
 
 
 def agreement(angles: Float[np.ndarray, " chord"]) -> complex:
