@@ -482,6 +482,7 @@ FAULTS = {
     "jump": lambda o, k: o.at[1].add(jnp.where(between(k, 40, 58), 3.0, 0.0)),
     "half a meter": lambda o, k: o.at[1].add(jnp.where(between(k, 40, 45), 0.5, 0.0)),
     "yaw": lambda o, k: o.at[2].add(jnp.where(between(k, 40, 58), jnp.pi, 0.0)),
+    "behind": lambda o, k: o.at[:2].add(jnp.where(between(k, 40, 58), -5.0, 0.0)),
     "alternating": lambda o, k: o.at[1].add(jnp.where(k % 2 == 0, 2.0, 0.0) * (k > 40)),
     "frozen": lambda o, k: jnp.where(between(k, 40, 50), jnp.arange(4.0) / 8, o),
     "silent": lambda o, k: jnp.where(between(k, 40, 50), jnp.nan, o),

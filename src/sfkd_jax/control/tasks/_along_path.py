@@ -30,6 +30,7 @@ from sfkd_jax.geometry import (
     LATERAL,
     PATH_SPEED,
     PathState,
+    between,
     curvature_ahead,
     path_coordinates,
     path_state,
@@ -37,6 +38,7 @@ from sfkd_jax.geometry import (
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
+    POSE,
     Control,
     Controller,
     ControllerInfo,
@@ -44,6 +46,7 @@ from sfkd_jax.types import (
     Key,
     Params,
     Reference,
+    Scalar,
     State,
 )
 
@@ -54,6 +57,8 @@ class Preview(NamedTuple):
     Attributes:
         road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
             finite.
+        along: distance of the observed position from the first point of the reference,
+            along the path [m].
         repeated: whether the observation is bit for bit the last one, as of a sensor
             that freezes.
         measured: which entries of ξ are measured; behind a `Gate` the others are
@@ -63,6 +68,7 @@ class Preview(NamedTuple):
     """
 
     road: Float[Array, "horizon 2"]
+    along: Scalar
     repeated: Bool[Array, ""]
     measured: Bool[Array, " coordinate"]
     on_time: Bool[Array, ""]
@@ -125,7 +131,12 @@ class AlongReference:
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
         repeated = jnp.all(observation == state.observation)
         preview = Preview(
-            road, repeated, jnp.isfinite(xi), on_time=jnp.asarray(True), trusted=precise
+            road=road,
+            along=between(reference[0, POSE], observation[POSE])[0],
+            repeated=repeated,
+            measured=jnp.isfinite(xi),
+            on_time=jnp.asarray(True),
+            trusted=precise,
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info["predicted_states"]

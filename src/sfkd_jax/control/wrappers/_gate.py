@@ -85,6 +85,7 @@ class GateState(NamedTuple):
         inner: state of the wrapped controller.
         expected: ξ predicted for this step; NaN before the first measurement.
         modelled: whether the model predicted it, inside the conditions.
+        along: distance along the path of the last measured position, see `Preview`.
         missing: number of steps since a coordinate was last used.
         doubt: number of steps until the certificate may be claimed again, after a
             measurement was believed that nothing explains.
@@ -96,6 +97,7 @@ class GateState(NamedTuple):
     inner: Any
     expected: PathState
     modelled: Bool[Array, ""]
+    along: Scalar
     missing: Int[Array, " coordinate"]
     doubt: Int[Array, ""]
     env: Environment
@@ -150,9 +152,9 @@ class Gate:
     reads_env: bool = True
     patience: Positive = 2.0
     trial: Positive = 10.0
-    share: Positive = 0.7
-    gain: Fraction = 0.4
-    growth: Positive = 0.1
+    share: Positive = 0.6
+    gain: Fraction = 0.8
+    growth: Positive = 0.05
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -170,6 +172,7 @@ class Gate:
             inner=self.inner.init(key),
             expected=jnp.full(size, jnp.nan, dtype=float),
             modelled=jnp.asarray(False),
+            along=jnp.full((), jnp.nan),
             missing=jnp.zeros(size, jnp.int32),
             doubt=jnp.zeros((), jnp.int32),
             env=middle,
@@ -199,6 +202,10 @@ class Gate:
         stale = preview.repeated & (jnp.abs(expected[PATH_SPEED]) > MOVING)
         usable = jnp.isfinite(coordinates) & readable & ~stale
         plausible = jnp.abs(innovation) <= limit
+        # The path goes on under the vehicle: an observation that is suddenly ahead or
+        # behind is late, or of another place, in all of its entries.
+        shifted = jnp.abs(preview.along - state.along) > self._reach(state, periods)
+        plausible &= ~shifted
         # What stays implausible for so long is true: the prediction was wrong.
         late = state.missing >= round(self.patience / self.dt)
         measured = usable & (plausible | late | ~compared)
@@ -235,9 +242,21 @@ class Gate:
             "env_inside": info.get("env_inside", True) & env_known,
         }
         after = GateState(
-            inner, ahead, modelled, missing, jnp.maximum(doubt - 1, 0), known, road
+            inner=inner,
+            expected=ahead,
+            modelled=modelled,
+            along=jnp.where(jnp.any(measured), preview.along, state.along),
+            missing=missing,
+            doubt=jnp.maximum(doubt - 1, 0),
+            env=known,
+            road=road,
         )
         return control, after, report
+
+    def _reach(self, state: GateState, periods: Scalar) -> Scalar:
+        """How far the vehicle gets in a step, and somewhat more [m]."""
+        speed = jnp.abs(state.expected[PATH_SPEED])
+        return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
 
     def _limit(
         self, state: GateState, expected: PathState, periods: Scalar
@@ -245,11 +264,11 @@ class Gate:
         """The largest difference that one step explains, entry by entry."""
         # What a vehicle can reach in a step without knowing its model: sideways what
         # it drives, and more than any tyre turns, accelerates and slides.
-        speed = jnp.abs(expected[PATH_SPEED])
         wide = jnp.full(expected.shape, jnp.inf, dtype=float)
-        wide = wide.at[LATERAL].set(1.3 * speed * self.dt + 0.2)
         wide = wide.at[HEADING].set(0.35).at[PATH_SPEED].set(1.5)
-        limit = wide * jnp.maximum(periods, 1.0)
+        wide = wide * jnp.maximum(periods, 1.0)
+        wide = wide.at[LATERAL].set(self._reach(state, periods))
+        limit = wide
         if self.conditions.state is not None:
             low, high = map(jnp.asarray, self.conditions.state)
             tight = 0.5 * self.share * (high - low)
