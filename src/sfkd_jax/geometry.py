@@ -177,14 +177,40 @@ def path_coordinates(
     return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
 
 
+STANDING = 1e-3
+"""Distance below which two points of a reference are the same place [m]."""
+SLOWEST = 0.1
+"""Reference speed above which the points have to move [m/s]."""
+
+
+def followable(reference: Reference) -> tuple[Reference, Bool[Array, ""]]:
+    """Return a reference that a car can follow, and whether it is the given one.
+
+    The speed is 0 where points stand still at a speed, or where the speed is negative:
+    every law here drives forwards.
+    """
+    steps = jnp.diff(reference[:, :2], axis=0)
+    still = jnp.hypot(steps[:, 0], steps[:, 1]) < STANDING
+    # The first point has none before it, and moves as the next one does.
+    still = jnp.concatenate([still[:1], still]) & (reference[:, 3] > SLOWEST)
+    wrong = still | (reference[:, 3] < 0.0)
+    return reference.at[:, 3].set(jnp.where(wrong, 0.0, reference[:, 3])), ~wrong.any()
+
+
 def curvature_between(reference: Reference) -> Float[Array, " gap"]:
-    """Return κ [1/m] between reference points: the change of yaw over the distance."""
+    """Return κ [1/m] between reference points: the change of yaw over the distance.
+
+    Where points coincide, as where a car waits, it is that of the gap before.
+    """
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
-    # Points that coincide, as where a car waits, have no direction to turn from.
-    moved = distance > 1e-3
+    # Points that coincide have no direction to turn from.
+    moved = distance > STANDING
     turned = wrap_angle(steps[:, 2])
-    return jnp.where(moved, turned / jnp.where(moved, distance, 1.0), 0.0)
+    curvature = jnp.where(moved, turned / jnp.where(moved, distance, 1.0), 0.0)
+    # A car that stops in a bend keeps its steering.
+    last = jax.lax.cummax(jnp.where(moved, jnp.arange(moved.shape[0]), 0))
+    return curvature[last]
 
 
 def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:

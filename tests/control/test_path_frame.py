@@ -1,13 +1,17 @@
 """Path errors, the hand-made feedback law, and the tracking cost."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import jit, straight
 
-from sfkd_jax import control
+from sfkd_jax import control, models, plants, scenarios
 from sfkd_jax.control import PathErrors, StageInputs
+from sfkd_jax.geometry import followable
+from sfkd_jax.scenarios import reference_window
 
 ERRORS = jit(jax.vmap(control.path_errors))
 RADIUS = 40.0
@@ -101,6 +105,116 @@ def test_the_law_steers_and_brakes_against_its_errors():
     np.testing.assert_allclose(
         commanded(off, scalar(0.0), scalar(9.0))[1], 8.0, rtol=1e-6
     )
+
+
+def test_near_the_path_and_above_5_m_s_the_law_is_linear_bit_for_bit():
+    random = np.random.default_rng(0)
+    errors = PathErrors(*(scalar(random.uniform(-e, e, 500)) for e in (1.2, 0.2, 1.0)))
+    road = scalar(random.uniform(-0.02, 0.02, 500)), scalar(random.uniform(6, 13, 500))
+    for loop in (False, True):
+        laws = (
+            jax.vmap(law(wheelbase=2.7, speed_loop=loop))(errors, *road)
+            for law in (control.LinearFeedback, control.path_feedback)
+        )
+        np.testing.assert_array_equal(*laws)
+
+
+@pytest.mark.parametrize("name", ["kinematic", "dynamic"])
+def test_the_law_comes_back_from_anywhere(name):
+    """Within 0.3 m and 0.3 rad for good after 21 s; linear, a fifth of these do not."""
+    plant = getattr(plants, name)()
+    law = control.path_feedback(wheelbase=plant.wheelbase)
+    limits = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
+
+    @jit
+    @jax.vmap
+    def drive(start, friction):
+        def step(state, _):
+            point = jnp.stack([state[0], 0.0, 0.0, 10.0])
+            errors = control.path_errors(state, point, jnp.zeros(()))
+            u = jnp.clip(law(errors, jnp.zeros(()), point[3]), *limits)
+            state = plant.step(state, u, jnp.stack([friction, 0.0]))
+            return state, state[1:3]
+
+        return jax.lax.scan(step, start, length=250)[1]
+
+    places = itertools.product((0.3, 3.0, -20.0), (0.0, 1.6, -2.5, 3.1), (6.0, 10.0))
+    places = np.asarray([(*place, mu) for place in places for mu in (0.3, 0.9)])
+    starts = np.zeros((len(places), len(plant.state_names)), np.float32)
+    starts[:, 1:4] = places[:, :3]
+    driven = np.asarray(drive(starts, np.float32(places[:, 3])))[:, 210:]
+    assert np.max(np.abs(driven[..., 0])) < 0.3
+    assert np.max(np.abs(np.sin(driven[..., 1] / 2))) < np.sin(0.15)
+
+
+def planned(wheelbase, starts, speeds):
+    """States, controls and health of 25 s on 60 m of straight road, from these starts
+    at these reference speeds, planned with 64 samples.
+    """
+    road = scenarios.path_through(jnp.asarray([[0.0, 0.0], [30.0, 0.0], [60.0, 0.0]]))
+    limits = {"control_low": (-0.5, -6.0), "control_high": (0.5, 3.0)}
+    step = plants.own(wheelbase=wheelbase, **limits).nominal
+    law = control.path_feedback(wheelbase=wheelbase)
+    cost = control.tracking_cost(dt=0.1)
+    task = control.path_tracking(models.physics(step), cost, law, dt=0.1, **limits)
+    planner = control.mppi(task, num_samples=64, horizon=10, effective_samples=20.0)
+
+    @jit
+    @jax.vmap
+    def drive(start, speed):
+        def advance(carry, _):
+            state, along, memory = carry
+            window = reference_window(road, along, speed, dt=0.1, horizon=10)
+            u, memory, info = planner.act({}, memory, state, jnp.zeros(2), window)
+            state = step(state, u, jnp.zeros(2))
+            along, _ = scenarios.project(road, state[:2], along)
+            return (state, along, memory), (state, u, info["healthy"])
+
+        begin = (start, start[0], planner.init(jax.random.key(0)))
+        return jax.lax.scan(advance, begin, length=250)[1]
+
+    return map(np.asarray, drive(scalar(starts), scalar(speeds)))
+
+
+SLOW = np.asarray([0.3, 0.5, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("wheelbase", [0.33, 2.7])
+def test_a_slow_planner_drives_on_its_path_a_stopped_one_stays_and_a_road_ends(
+    wheelbase,
+):
+    starts = [[0.0, 0.3, 0.0, speed] for speed in SLOW]
+    # Told to stop; near the end of the road; told to reverse.
+    starts += [[0.0, 0.3, 0.0, 3.0], [20.0, 0.0, 0.0, 8.0], [0.0, 0.0, 0.0, 3.0]]
+    speeds = np.asarray([*SLOW, 0.0, 8.0, -2.0])
+    states, controls, healthy = planned(wheelbase, starts, speeds)
+    assert np.max(np.abs(states[:4, 99, 1])) < 0.02
+    assert np.min(np.mean(states[:4, 50:100, 3], axis=1) / SLOW) > 0.98
+    still, steering = states[4:, 150:], controls[4:, 150:, 0]
+    assert np.max(still[..., 3]) < 1e-3
+    np.testing.assert_allclose(still, still[:, :1] + 0.0 * still, atol=1e-3)
+    assert np.max(np.abs(np.diff(steering, axis=1))) < 1e-4
+    assert 59.5 < still[1, 0, 0] < 60.5
+    np.testing.assert_array_equal(np.all(healthy, axis=1), speeds >= 0.0)
+
+
+@pytest.mark.parametrize("change", [{3: -1.0}, {0: 5.0}])
+def test_a_reference_that_cannot_be_followed_is_one_to_stop(change):
+    """Backwards, or at one place at a speed."""
+    window = straight(6)
+    assert jit(followable)(window)[1]
+    for column, value in change.items():
+        window = window.at[3:, column].set(value)
+    stopped, known = jit(followable)(window)
+    assert not known
+    assert np.all(stopped[4:, 3] == 0.0)
+    assert np.all(stopped[:3] == window[:3])
+
+
+def test_a_car_that_stops_in_a_bend_keeps_its_curvature():
+    window = on_circle(np.minimum(np.arange(1.0, 9.0), 4.0)).astype(np.float32)
+    curvature = jit(control.reference_curvature)(window)
+    np.testing.assert_allclose(curvature, np.full(8, 1 / RADIUS), rtol=1e-3)
 
 
 def stage(

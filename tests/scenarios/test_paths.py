@@ -116,6 +116,54 @@ def test_the_reference_window_holds_the_next_points_at_the_given_speed(circle):
     np.testing.assert_array_equal(np.asarray(window)[:, 3], np.full(5, 8.0))
 
 
+def test_beyond_its_end_a_path_is_its_last_point_and_the_reference_stands_there(road):
+    end, beyond = np.asarray(road.points)[-1], road.length + 30.0
+    position = end[:2] + 30.0 * np.asarray([np.cos(end[2]), np.sin(end[2])])
+    for guess in (0.9 * beyond, beyond):
+        s, lateral = project(road, jnp.asarray(position), guess)
+        assert s == road.length
+        np.testing.assert_allclose(lateral, 0.0, atol=1e-3)
+    window = reference_window(road, s, jnp.asarray(10.0), dt=0.1, horizon=4)
+    np.testing.assert_allclose(window, np.tile([*end[:3], 0.0], (4, 1)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("left", [100.0, 15.0, 3.0])
+def test_before_the_end_the_points_brake_to_it(road, left):
+    """Their speeds are those of their distances, and fall by 2 m/s a second."""
+    speed, dt = 9.0, 0.01
+    window = np.asarray(
+        jit(partial(reference_window, dt=dt, horizon=3000, deceleration=2.0))(
+            road, road.length - left, jnp.asarray(speed)
+        )
+    )
+    np.testing.assert_allclose(window[-1, :2], road.points[-1, :2], rtol=1e-6)
+    assert window[-1, 3] == 0.0
+    gaps = np.hypot(*np.diff(window[:, :2], axis=0).T) / dt
+    np.testing.assert_allclose(gaps, window[1:, 3], atol=0.03)
+    assert np.min(np.diff(window[:, 3])) > -2.0 * dt - 1e-4
+    assert window[0, 3] <= min(speed, np.sqrt(2 * 2.0 * left))
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_a_closed_path_goes_round_for_ever(repeated):
+    """Distances, points and the window are the same in the second lap."""
+    angle = np.linspace(0.0, 2 * np.pi, 600, endpoint=repeated)
+    points = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    lap = scenarios.path_through(jnp.asarray(points, jnp.float32), closed=True)
+    np.testing.assert_allclose(lap.length, 2 * np.pi * 60.0, rtol=1e-4)
+    np.testing.assert_allclose(np.asarray(lap.points)[:, 3], 1 / 60.0, rtol=0.02)
+    np.testing.assert_allclose(lap.points[0, :2], lap.points[-1, :2], atol=1e-5)
+    place = jnp.asarray([60.5 * np.cos(0.01), 60.5 * np.sin(0.01)])
+    for guess in (0.0, lap.length - 1.0, lap.length + 1.0, -1.0):
+        s, lateral = project(lap, place, jnp.asarray(guess))
+        np.testing.assert_allclose([s, lateral], [0.6, -0.5], atol=5e-3)
+    window = partial(reference_window, lap, speed=jnp.asarray(9.0), dt=0.1, horizon=5)
+    first, second = window(lap.length - 2.0), window(2 * lap.length - 2.0)
+    np.testing.assert_allclose(first[:, [0, 1, 3]], second[:, [0, 1, 3]], atol=1e-3)
+    np.testing.assert_allclose(np.diff(first[:, 2]), 0.9 / 60.0, rtol=0.05)
+    np.testing.assert_allclose(second[:, 2] - first[:, 2], 2 * np.pi, atol=1e-3)
+
+
 def test_a_path_through_positions_on_a_circle_has_its_curvature_and_runs_through_them():
     radius, angle = 40.0, np.linspace(0.0, 1.5, 400)
     points = np.column_stack([radius * np.sin(angle), radius * (1 - np.cos(angle))])

@@ -222,9 +222,9 @@ class DrivingTask:
         # Facing backwards is leaving too: the other errors would not show it.
         backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
         left = ~sound | (jnp.abs(kept.lateral) > self.lane) | backwards
-        length = (road.path.points.shape[0] - 1) * road.path.spacing
         # Time or road, whichever ends first.
-        ended = (kept.count >= road.envs.shape[0]) | (kept.progress >= length)
+        over = kept.progress >= road.path.length
+        ended = (kept.count >= road.envs.shape[0]) | over
         missed = kept.state[3] - road.speed
         turned = (kept.control[0] - before.control[0]) / self.plant.dt
         cost = (

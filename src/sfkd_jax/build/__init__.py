@@ -213,7 +213,8 @@ def space_from_settings(settings: Values) -> Space:
 
 def build_driver(plant: plants.Vehicle) -> Driver:
     """Return the path-following law that drives while data are collected."""
-    law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+    # Linear: it is part of every data set of a seed.
+    law = control.LinearFeedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
 
     def driver(state: State, reference: Reference) -> Control:
         curvature = control.reference_curvature(reference)[0]

@@ -2,6 +2,7 @@
 
 from sfkd_jax.control._factory import factory as factory
 from sfkd_jax.control.laws._feedback import FeedbackLaw as FeedbackLaw
+from sfkd_jax.control.laws._feedback import LinearFeedback as LinearFeedback
 from sfkd_jax.control.laws._feedback import ModelLaw as ModelLaw
 from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
 from sfkd_jax.control.laws._feedback import no_feedback as no_feedback

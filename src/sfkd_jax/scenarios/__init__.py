@@ -7,6 +7,7 @@ from sfkd_jax.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
+from sfkd_jax.scenarios._paths import Lap as Lap
 from sfkd_jax.scenarios._paths import Path as Path
 from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
 from sfkd_jax.scenarios._paths import path_through as path_through

@@ -34,6 +34,19 @@ class Path(NamedTuple):
     points: Float[Array, "point 4"]
     spacing: Scalar
 
+    @property
+    def length(self) -> Scalar:
+        """Arc length [m]."""
+        return (self.points.shape[0] - 1) * self.spacing
+
+
+class Lap(Path):
+    """A closed path: its last point is its first one, the yaw turned on by a lap.
+
+    A type of its own, not a field: whether a path is closed is known when a program is
+    traced, and open paths cost nothing more.
+    """
+
 
 def smooth_path(
     key: Key,
@@ -114,21 +127,27 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
 
 
-def path_through(points: Float[Array, "point 2"], *, spacing: float = SPACING) -> Path:
+def path_through(
+    points: Float[Array, "point 2"], *, spacing: float = SPACING, closed: bool = False
+) -> Path:
     """Return a path through positions, resampled at equal distances.
 
     Yaw and curvature are central differences. The path is straight between positions,
-    so these should be dense: several per `spacing` on a sharp turn. Its length is a
-    multiple of `spacing`.
+    so these should be dense: several per `spacing` on a sharp turn. The length of an
+    open path is a multiple of `spacing`; a closed one changes its spacing instead.
 
     Args:
         points: positions [m].
         spacing: between samples [m].
+        closed: whether the last position leads back to the first, which need not be
+            repeated. The path is then a `Lap`.
 
     Raises:
         ValueError: a path too short for its spacing, positions that are not finite, or
             two consecutive positions that coincide.
     """
+    if closed and bool(jnp.any(points[0] != points[-1])):
+        points = jnp.concatenate([points, points[:1]])
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
     # `bool` needs concrete arrays: a path is made before a program is traced.
     if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
@@ -141,20 +160,37 @@ def path_through(points: Float[Array, "point 2"], *, spacing: float = SPACING) -
             f"a path of {float(along[-1]):.3g} m has too few samples "
             f"at a spacing of {spacing} m"
         )
+    if closed:
+        spacing = float(along[-1]) / (count - 1)
     s = jnp.arange(count) * spacing
-    x, y = (jnp.interp(s, along, points[:, axis]) for axis in (0, 1))
+    x, y = (_around(jnp.interp(s, along, axis), closed) for axis in points.T)
     along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
     # Unwrapped: the curvature is its slope, which must not jump by 2π.
     yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
     curvature = jnp.asarray(jnp.gradient(yaw)) / spacing
-    return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
+    samples = jnp.stack([x, y, yaw, curvature], axis=1)
+    if closed:
+        return Lap(samples[2:-2], jnp.asarray(spacing))
+    return Path(samples, jnp.asarray(spacing))
+
+
+def _around(samples: Array, closed: bool) -> Array:
+    """Continue a closed path by two samples at both ends, for its differences."""
+    if not closed:
+        return samples
+    return jnp.concatenate([samples[-3:-1], samples, samples[1:3]])
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
     """Return x, y, yaw, curvature at arc length s [m], which is clamped to the path.
 
-    Between two samples the path is a clothoid.
+    Between two samples the path is a clothoid. Around a `Lap` s goes on for ever, and
+    the yaw with it.
     """
+    if isinstance(path, Lap):
+        laps = jnp.floor(s / path.length)
+        point = point_at(Path(*path), s - laps * path.length)
+        return point.at[2].add(laps * (path.points[-1, 2] - path.points[0, 2]))
     last = path.points.shape[0] - 2
     index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
     start, end = path.points[index], path.points[index + 1]
@@ -174,8 +210,10 @@ def project(
 ) -> tuple[Scalar, Scalar]:
     """Return the arc length of the closest point and the signed distance to it [m].
 
-    Newton steps from `s_guess`; left of the path the distance is positive.
+    Newton steps from `s_guess`; left of the path the distance is positive. Beyond an
+    end the closest point is the end; around a `Lap` the arc length starts anew.
     """
+    closed = isinstance(path, Lap)
     s = s_guess
     # Few steps suffice, since the guess is the last foot point moved on.
     for _ in range(3):
@@ -183,18 +221,51 @@ def project(
         along, left = _offsets(point, position)
         # Near the centre of a curve the Newton step would divide by 0.
         s = s + along / jnp.maximum(1.0 - point[3] * left, 0.2)
+        # Every step: one that left the path would go on from a point that is not on it.
+        s = s % path.length if closed else jnp.clip(s, 0.0, path.length)
     return s, _offsets(point_at(path, s), position)[1]
 
 
 def reference_window(
-    path: Path, s: Scalar, speed: Scalar, *, dt: float, horizon: int
+    path: Path,
+    s: Scalar,
+    speed: Scalar,
+    *,
+    dt: float,
+    horizon: int,
+    deceleration: float = 2.5,
 ) -> Reference:
-    """Return the next points at a constant speed: x, y, yaw, speed, (horizon, 4)."""
+    """Return the next points at a constant speed: x, y, yaw, speed, (horizon, 4).
+
+    Before the end of a path the speed falls so that the points stop there, at speed 0.
+
+    Args:
+        path: open, or a `Lap`, which has no end.
+        s: arc length of the vehicle [m].
+        speed: v [m/s].
+        dt: sampling period [s].
+        horizon: number of points.
+        deceleration: towards the end [m/s²].
+    """
     # From one step ahead on: the present state cannot be changed any more.
+    times = dt * jnp.arange(1, horizon + 1)
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
+    speeds = jnp.broadcast_to(speed, ahead.shape)
+    if not isinstance(path, Lap):
+        left, braking = jnp.maximum(path.length - s, 0.0), speed**2 / 2 / deceleration
+        # Until standstill: cruise and brake, or brake alone where the end is near.
+        until = jnp.where(
+            left > braking,
+            (left - braking) / jnp.maximum(speed, 1e-3) + speed / deceleration,
+            jnp.sqrt(2.0 * left / deceleration),
+        )
+        falling = deceleration * jnp.maximum(until - times, 0.0)
+        near = (path.length - ahead < braking) & (speed > 0.0)
+        ahead = jnp.where(near, path.length - falling**2 / 2 / deceleration, ahead)
+        speeds = jnp.where(near, falling, speeds)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
     # The fourth column of a reference is the speed, where a path has its curvature.
-    return points.at[:, 3].set(speed)
+    return points.at[:, 3].set(speeds)
 
 
 def _offsets(

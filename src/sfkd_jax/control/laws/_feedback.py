@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control.laws._recovery import (
+    CREEP,
+    PathErrors,
+    Recovery,
+    holding,
+    moving,
+    often,
+    recovery,
+)
 from sfkd_jax.control.laws._steady_turn import (
     Linearised,
     SteadyTurn,
@@ -20,24 +31,16 @@ from sfkd_jax.geometry import path_step, wrap_angle
 from sfkd_jax.ranges import Positive
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
+FULL_LOCK = 0.5
+"""Steering angle that decides which arcs a car can drive [rad]."""
+PROBE = 2e-3
+"""Curvature of a turn that tells how much steering a curvature takes [1/m]."""
+SHORTEST = 0.05
+"""Lower limit of what it tells [m]."""
 NEWTON = 4
 """Newton steps to a steady turn from straight driving. For the benchmark's vehicles
 that reaches the accuracy of float32.
 """
-
-
-class PathErrors(NamedTuple):
-    """Errors of a state relative to one reference point.
-
-    Attributes:
-        lateral: distance left of the path [m].
-        heading: yaw relative to the path [rad].
-        speed: relative to the reference [m/s].
-    """
-
-    lateral: Scalar
-    heading: Scalar
-    speed: Scalar
 
 
 FeedbackLaw: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
@@ -66,20 +69,14 @@ def path_errors(
     return PathErrors(lateral, heading, state[3] - point[3])
 
 
-def path_feedback(
-    *,
-    wheelbase: float,
-    lateral_gain: float = 0.03,
-    heading_gain: float = 0.4,
-    speed_gain: float = 1.0,
-    speed_loop: bool = False,
-) -> FeedbackLaw:
-    """Return the path-following law u = u_ff(κ) + K ξ.
+@dataclass(frozen=True, kw_only=True)
+class LinearFeedback:
+    """The path-following law u = u_ff(κ) + K ξ, for small errors.
 
         δ = atan(L κ) − k_y e_y − k_ψ e_ψ
         a = −k_v e_v,   or the speed command v_ref − k_v e_v
 
-    Args:
+    Attributes:
         wheelbase: L [m].
         lateral_gain: k_y [rad/m].
         heading_gain: k_ψ [-].
@@ -87,17 +84,61 @@ def path_feedback(
         speed_loop: whether the second control is a speed command.
     """
 
-    def law(errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+    wheelbase: float
+    lateral_gain: float = 0.03
+    heading_gain: float = 0.4
+    speed_gain: float = 1.0
+    speed_loop: bool = False
+
+    def __call__(self, errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        """Return u, without any limit."""
         # Feed-forward of the bicycle without slip; feedback makes up for the rest.
         steering = (
-            jnp.arctan(wheelbase * curvature)
-            - lateral_gain * errors.lateral
-            - heading_gain * errors.heading
+            jnp.arctan(self.wheelbase * curvature)
+            - self.lateral_gain * errors.lateral
+            - self.heading_gain * errors.heading
         )
-        correction = -speed_gain * errors.speed
-        return jnp.stack([steering, correction + speed if speed_loop else correction])
+        correction = -self.speed_gain * errors.speed
+        return jnp.stack(
+            [steering, correction + speed if self.speed_loop else correction]
+        )
 
-    return law
+
+@dataclass(frozen=True, kw_only=True)
+class PathFeedback(LinearFeedback):
+    """`LinearFeedback` that comes back from anywhere, crawls, and stops.
+
+    Near the path and from 5 m/s on it is that law, bit for bit. Far from the path its
+    errors are those of `recovery`. Below 5 m/s it steers over a time and not over a
+    distance: K is scaled as if the car were that fast. Where the reference stands, it
+    brakes to standstill and holds the steering.
+    """
+
+    def __call__(self, errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
+        """Return u, without any limit of the actuators."""
+        more, back = self._recovery(errors, speed)
+        lateral, heading, fast = back.errors
+        scaled = PathErrors(more**2 * lateral, more * heading, fast)
+        control = super().__call__(scaled, curvature, back.speed)
+        room = self.wheelbase * back.curvature * moving(errors.speed + speed, speed)
+        ahead = jnp.arctan(self.wheelbase * curvature)
+        steering = jnp.clip(control[0], ahead - room, ahead + room)
+        return jnp.stack([steering, control[1] - holding(errors, speed)])
+
+    def authority(self, errors: PathErrors, speed: Scalar) -> Scalar:
+        """Return the share of a perturbation that acts, see `Recovery`."""
+        return self._recovery(errors, speed)[1].authority
+
+    def _recovery(self, errors: PathErrors, speed: Scalar) -> tuple[Scalar, Recovery]:
+        """How much more the law steers per distance, and its errors."""
+        more = often(jnp.maximum(errors.speed + speed, speed))
+        slope = max(self.lateral_gain, 1e-6) / max(self.heading_gain, 1e-6) * more
+        tightest = math.tan(FULL_LOCK) / self.wheelbase
+        return more, recovery(errors, speed, slope=slope, tightest=tightest)
+
+
+path_feedback = PathFeedback
+"""(settings of `LinearFeedback`) -> law."""
 
 
 def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
@@ -111,6 +152,13 @@ def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
     return law
 
 
+class ModelTurn(NamedTuple):
+    """Steady turns of a model, and d steering / d curvature at low curvature [m]."""
+
+    steady: SteadyTurn
+    wheelbase: Float[Array, "*step"]
+
+
 class ModelLaw(NamedTuple):
     """A feedback law around the steady turns of a model, with its Riccati gains.
 
@@ -121,7 +169,8 @@ class ModelLaw(NamedTuple):
     there, with the weights below. In side wind ξ* crabs, on a slippery road u* steers
     more: what the model knows of e becomes feed-forward, and a planner samples only the
     rest. If Newton's method does not converge (the circle is too fast for the
-    friction), the law is that of straight driving, gain included.
+    friction), the law is that of straight driving, gain included. Far from the path
+    the errors are those of `recovery`.
 
     Attributes:
         lateral: weight in the Riccati equation [1/m²].
@@ -144,7 +193,7 @@ class ModelLaw(NamedTuple):
         like: State,
         reference: Reference,
         curvature: Array,
-    ) -> SteadyTurn:
+    ) -> ModelTurn:
         """Return the steady turns at every point of a reference.
 
         Args:
@@ -171,11 +220,17 @@ class ModelLaw(NamedTuple):
                 steps=NEWTON,
             )
 
+        # A car that stands has no turn: the slowest one, with which it would start.
+        speeds = jnp.maximum(reference[:, 3], CREEP)
+        # One point more, which tells how much steering a curvature takes.
+        curvature = jnp.append(curvature, PROBE)
         both = jax.vmap(jax.vmap(turn), in_axes=(0, None))(
             # Straight driving in the same batch: what is chosen where a turn fails.
             jnp.stack([curvature, 0.0 * curvature]),
-            reference[:, 3],
+            jnp.append(speeds, speeds[0]),
         )
+        wheelbase = (both.both[0, -1, size] - both.both[1, -1, size]) / PROBE
+        both = jax.tree.map(lambda leaf: leaf[:, :-1], both)
         # A circle that the tyres cannot hold has no steady turn: drive straight.
         valid = both.steady[0]
         chosen = jax.tree.map(lambda part: jax.vmap(jnp.where)(valid, *part), both)
@@ -187,13 +242,20 @@ class ModelLaw(NamedTuple):
             jnp.asarray([self.steering, self.drive]),
         )
         state, control = jnp.split(chosen.both, [size], axis=1)
-        return SteadyTurn(
-            state, control, jnp.broadcast_to(gain, (*control.shape, size))
+        # No drive where the reference stands, or the car would creep.
+        stands = reference[:, 3] == 0.0
+        control = control.at[:, 1].set(jnp.where(stands, 0.0, control[:, 1]))
+        state = state.at[:, 2].set(reference[:, 3])
+        gain = jnp.broadcast_to(gain, (*control.shape, size))
+        return ModelTurn(
+            SteadyTurn(state, control, gain),
+            # NaN compares as False.
+            jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST) + 0.0 * speeds,
         )
 
     def control(
         self,
-        turn: SteadyTurn,
+        turn: ModelTurn,
         state: State,
         point: Float[Array, " 4"],
         curvature: Scalar,
@@ -206,6 +268,38 @@ class ModelLaw(NamedTuple):
             point: x, y, yaw, speed of the reference.
             curvature: of the path at `point` [1/m].
         """
-        errors = path_errors(state, point, curvature)
-        pose = jnp.stack([errors.lateral, errors.heading])
-        return turn.feedback(jnp.concatenate([pose, state[BODY]]))
+        steady, errors = turn.steady, path_errors(state, point, curvature)
+        back = self._recovery(turn, state, point, curvature)
+        saturated = steady.state[:3] + jnp.stack(back.errors)
+        control = steady.feedback(jnp.concatenate([saturated, state[BODY][1:]]))
+        room = turn.wheelbase * back.curvature * moving(state[3], point[3])
+        middle = steady.control[0]
+        steering = jnp.clip(control[0], middle - room, middle + room)
+        return jnp.stack([steering, control[1] - holding(errors, point[3])])
+
+    def authority(
+        self,
+        turn: ModelTurn,
+        state: State,
+        point: Float[Array, " 4"],
+        curvature: Scalar,
+    ) -> Scalar:
+        """Return the share of a perturbation that acts, see `Recovery`."""
+        return self._recovery(turn, state, point, curvature).authority
+
+    def _recovery(
+        self,
+        turn: ModelTurn,
+        state: State,
+        point: Float[Array, " 4"],
+        curvature: Scalar,
+    ) -> Recovery:
+        """The errors from ξ*: in side wind a car on its path has a heading error."""
+        errors, gain = path_errors(state, point, curvature), turn.steady.gain[0]
+        return recovery(
+            errors._replace(heading=errors.heading - turn.steady.state[1]),
+            point[3],
+            # Finite where there is no gain.
+            slope=jnp.maximum(gain[0] / (gain[1] + 1e-6), 1e-3),
+            tightest=math.tan(FULL_LOCK) / turn.wheelbase,
+        )

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control.laws._feedback import PathErrors, path_errors
+from sfkd_jax.control.laws._feedback import path_errors
+from sfkd_jax.control.laws._recovery import PathErrors
 from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
@@ -26,7 +27,7 @@ from sfkd_jax.control.tasks._task import (
     StepResult,
     Task,
 )
-from sfkd_jax.geometry import between, compose, reference_curvature
+from sfkd_jax.geometry import between, compose, followable, reference_curvature
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
     BODY,
@@ -148,6 +149,7 @@ class _LiftedTracking:
         """Return the matrices of e, the lifted observation and the path ahead."""
         assert self.model.structure.linear is not None
         predictor = self.model.structure.linear(self.model.fiber(params, env))
+        reference, known = followable(reference)
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
         # Progress counts from here: the predictor knows the path by its curvature only.
@@ -161,7 +163,7 @@ class _LiftedTracking:
         behind = between(reference[0, POSE], observation[POSE])[0] - passed
         over = jnp.concatenate([curvature[:1], mean])
         targets = _LiftedTarget(reference, curvature, over, behind)
-        return RolloutSetup(predictor._replace(lift=None), first, targets)
+        return RolloutSetup(predictor._replace(lift=None), first, targets, known)
 
     def step(
         self,

@@ -126,7 +126,8 @@ class Planner:
 
     Values that are not finite never enter the plan. If all rollouts are not finite, or
     the observation, environment or reference is not, the controller continues the last
-    healthy plan and `info["healthy"]` is False.
+    healthy plan and `info["healthy"]` is False. So it is where the reference cannot be
+    followed, see `RolloutSetup.followable`.
 
     A planner of your own is a subclass with `search`, and `factory(Mine,
     Mine.controller)` its factory; an entry in `build.PLANNERS` gives it settings.
@@ -266,7 +267,7 @@ class Planner:
             "cost": result.cost,
             "mean_cost": costs[chosen],
             "effective_samples": result.effective_samples,
-            "healthy": healthy,
+            "healthy": healthy & setup.followable,
             "env_inside": known,
             "predicted_states": jax.tree.map(lambda leaf: leaf[:, chosen], states),
         }

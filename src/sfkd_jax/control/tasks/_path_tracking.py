@@ -15,8 +15,14 @@ from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import (
     FeedbackLaw,
     ModelLaw,
-    PathErrors,
+    PathFeedback,
     path_errors,
+)
+from sfkd_jax.control.laws._recovery import (
+    CREEP,
+    SLOW_STEERING,
+    PathErrors,
+    moving,
 )
 from sfkd_jax.control.tasks._task import (
     Environments,
@@ -28,7 +34,7 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
-from sfkd_jax.geometry import is_precise, reference_curvature
+from sfkd_jax.geometry import followable, is_precise, reference_curvature
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -84,11 +90,11 @@ def tracking_cost(
 ) -> Cost:
     """Return the quadratic path-tracking cost, its weights under the argument names.
 
-        ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v e_v² + q_δ̇ (Δδ / dt)² + q_a a²
+        ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v (s e_v)² + q_δ̇ (Δδ / dt)² + q_a a²
 
     The course error Δe_y / (v dt) is the direction of travel relative to the path. A
     vehicle that crabs in a side wind or through a bend then aligns its direction of
-    travel with the path, not its body heading.
+    travel with the path, not its body heading. s is 1, or 5 m/s / v_ref below 5 m/s.
 
     Args:
         dt: sampling period [s].
@@ -110,11 +116,14 @@ def tracking_cost(
     def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
         errors, before = inputs.errors, inputs.errors_before
         # Finite at standstill.
-        travelled = inputs.speed * dt + 1e-3
+        travelled = jnp.maximum(inputs.speed, CREEP) * dt + 1e-3
         angle = (errors.lateral - before.lateral) / travelled
         rate = (inputs.control[0] - inputs.control_before[0]) / dt
         total = weights["lateral"] * errors.lateral**2 + weights["course"] * angle**2
-        total = total + weights["speed"] * errors.speed**2
+        # Relative to a low speed, or standing beside the path would be cheap.
+        slow = SLOW_STEERING / jnp.maximum(inputs.speed, CREEP)
+        slow = jnp.where(inputs.speed > 0.0, jnp.maximum(slow, 1.0), 1.0)
+        total = total + weights["speed"] * (slow * errors.speed) ** 2
         total = total + weights["steering_rate"] * rate**2
         return (
             total if speed_loop else total + weights["effort"] * inputs.control[1] ** 2
@@ -228,6 +237,7 @@ class PathTracking(LawTask):
     ) -> RolloutSetup:
         """Return fibre, start, law and targets, evaluated once per control step."""
         model, law = self.model, self.law
+        reference, known = followable(reference)
         # Many rollouts share this fibre; folding parameters that are folded is free.
         fiber = model.fiber(fold(model, params), env)
         curvature = reference_curvature(reference)
@@ -242,7 +252,7 @@ class PathTracking(LawTask):
         before = jnp.where(previous.known, previous.control, law_control)
         latent = model.encode(fiber, observation)
         start = PathSample(latent, model.decode(fiber, latent), errors, before)
-        return RolloutSetup(fiber, start, targets)
+        return RolloutSetup(fiber, start, targets, known)
 
     def step(
         self,
@@ -256,6 +266,7 @@ class PathTracking(LawTask):
         """Return one step of one rollout: law, perturbation, limits, model, cost."""
         model, point = self.model, target.point
         law_control = self._law_control(before.state, target)
+        nu = nu * self._authority(before.state, target)
         control = self.limit(law_control + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)
@@ -279,6 +290,17 @@ class PathTracking(LawTask):
         else:
             control = law(path_errors(state, point, curvature), curvature, point[3])
         return jnp.clip(control, *self.box())
+
+    def _authority(self, state: State, target: PathTarget) -> Scalar:
+        """The share of a perturbation that acts: not at rest, nor far from the path."""
+        point, curvature, law = target.point, target.curvature, self.law
+        share = moving(state[3], point[3])
+        if isinstance(law, ModelLaw):
+            share = share * law.authority(target.turn, state, point, curvature)
+        if isinstance(law, PathFeedback):
+            errors = path_errors(state, point, curvature)
+            share = share * law.authority(errors, point[3])
+        return share
 
 
 path_tracking = factory(PathTracking, lambda around: around.task(check_path))

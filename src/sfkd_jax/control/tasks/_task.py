@@ -41,11 +41,14 @@ class RolloutSetup(NamedTuple):
         context: shared by all samples and steps.
         start: state of one rollout before its first step.
         targets: data of each step; every leaf has the horizon as its leading axis.
+        followable: whether the reference is one that a plan can follow; if not, the
+            plan is that of the task's answer, and not healthy.
     """
 
     context: Any
     start: Any
     targets: Any
+    followable: Bool[Array, ""] | bool = True
 
 
 class StepResult(NamedTuple):
