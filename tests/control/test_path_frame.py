@@ -189,7 +189,7 @@ def test_a_slow_planner_drives_on_its_path_a_stopped_one_stays_and_a_road_ends(
     speeds = np.asarray([*SLOW, 0.0, 8.0, -2.0])
     states, controls, healthy = planned(wheelbase, starts, speeds)
     assert np.max(np.abs(states[:4, 99, 1])) < 0.02
-    assert np.min(np.mean(states[:4, 50:100, 3], axis=1) / SLOW) > 0.98
+    assert np.min(np.mean(states[:4, 100:150, 3], axis=1) / SLOW) > 0.98
     still, steering = states[4:, 150:], controls[4:, 150:, 0]
     assert np.max(still[..., 3]) < 1e-3
     np.testing.assert_allclose(still, still[:, :1] + 0.0 * still, atol=1e-3)

@@ -147,7 +147,7 @@ def test_before_the_end_the_points_brake_to_it(road, left):
 @pytest.mark.parametrize("repeated", [False, True])
 def test_a_closed_path_goes_round_for_ever(repeated):
     """Distances, points and the window are the same in the second lap."""
-    angle = np.linspace(0.0, 2 * np.pi, 600, endpoint=repeated)
+    angle = np.linspace(0.0, 2 * np.pi, 3000, endpoint=repeated)
     points = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     lap = scenarios.path_through(jnp.asarray(points, jnp.float32), closed=True)
     np.testing.assert_allclose(lap.length, 2 * np.pi * 60.0, rtol=1e-4)

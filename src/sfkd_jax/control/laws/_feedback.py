@@ -105,7 +105,7 @@ class LinearFeedback:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PathFeedback(LinearFeedback):
+class RecoveringFeedback(LinearFeedback):
     """`LinearFeedback` that comes back from anywhere, crawls, and stops.
 
     Near the path and from 5 m/s on it is that law, bit for bit. Far from the path its
@@ -137,7 +137,7 @@ class PathFeedback(LinearFeedback):
         return more, recovery(errors, speed, slope=slope, tightest=tightest)
 
 
-path_feedback = PathFeedback
+path_feedback = RecoveringFeedback
 """(settings of `LinearFeedback`) -> law."""
 
 

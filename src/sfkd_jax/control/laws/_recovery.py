@@ -133,8 +133,8 @@ def holding(errors: PathErrors, speed: Scalar) -> Scalar:
 def often(pace: Scalar) -> Scalar:
     """Return how much more a law steers per distance at low speed; 1 from 5 m/s on.
 
-    Below, errors decay over a time, as at 5 m/s: at 0.3 m/s a car takes 30 s for the 9 m
-    over which the linear law comes back.
+    Below, errors decay over a time, as at 5 m/s: at 0.3 m/s a car takes 30 s for the
+    9 m over which a linear law comes back.
 
     Args:
         pace: speed of the car, or of the reference if that is higher [m/s].

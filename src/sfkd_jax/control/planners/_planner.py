@@ -273,7 +273,8 @@ class Planner:
         }
         if precise is not None:
             # A coarse plan is driven, not replaced: it is better than the last one.
-            info["precision"], info["healthy"] = precise, healthy & precise
+            info["precision"] = precise
+            info["healthy"] = info["healthy"] & precise
         if violations is not None:
             info["violation"] = violations[chosen]
             info["constraints_kept"] = violations[chosen] <= 0.0

@@ -15,7 +15,7 @@ from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import (
     FeedbackLaw,
     ModelLaw,
-    PathFeedback,
+    RecoveringFeedback,
     path_errors,
 )
 from sfkd_jax.control.laws._recovery import (
@@ -297,7 +297,7 @@ class PathTracking(LawTask):
         share = moving(state[3], point[3])
         if isinstance(law, ModelLaw):
             share = share * law.authority(target.turn, state, point, curvature)
-        if isinstance(law, PathFeedback):
+        if isinstance(law, RecoveringFeedback):
             errors = path_errors(state, point, curvature)
             share = share * law.authority(errors, point[3])
         return share
