@@ -33,6 +33,8 @@ from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
 FULL_LOCK = 0.5
 """Steering angle that decides which arcs a car can drive [rad]."""
+GRIP = 2.5
+"""Lateral acceleration of a model's law far from the path [m/s²]."""
 PROBE = 2e-3
 """Curvature of a turn that tells how much steering a curvature takes [1/m]."""
 SHORTEST = 0.05
@@ -152,13 +154,6 @@ def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
     return law
 
 
-class ModelTurn(NamedTuple):
-    """Steady turns of a model, and d steering / d curvature at low curvature [m]."""
-
-    steady: SteadyTurn
-    wheelbase: Float[Array, "*step"]
-
-
 class ModelLaw(NamedTuple):
     """A feedback law around the steady turns of a model, with its Riccati gains.
 
@@ -170,7 +165,7 @@ class ModelLaw(NamedTuple):
     more: what the model knows of e becomes feed-forward, and a planner samples only the
     rest. If Newton's method does not converge (the circle is too fast for the
     friction), the law is that of straight driving, gain included. Far from the path
-    the errors are those of `recovery`.
+    it is `approach`.
 
     Attributes:
         lateral: weight in the Riccati equation [1/m²].
@@ -193,7 +188,7 @@ class ModelLaw(NamedTuple):
         like: State,
         reference: Reference,
         curvature: Array,
-    ) -> ModelTurn:
+    ) -> SteadyTurn:
         """Return the steady turns at every point of a reference.
 
         Args:
@@ -246,16 +241,19 @@ class ModelLaw(NamedTuple):
         stands = reference[:, 3] == 0.0
         control = control.at[:, 1].set(jnp.where(stands, 0.0, control[:, 1]))
         state = state.at[:, 2].set(reference[:, 3])
-        gain = jnp.broadcast_to(gain, (*control.shape, size))
-        return ModelTurn(
-            SteadyTurn(state, control, gain),
-            # NaN compares as False.
-            jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST) + 0.0 * speeds,
+        # NaN compares as False.
+        wheelbase = jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST)
+        grip = jnp.stack([wheelbase, jnp.asarray(GRIP)])
+        return SteadyTurn(
+            state,
+            control,
+            jnp.broadcast_to(gain, (*control.shape, size)),
+            jnp.broadcast_to(grip, (*stands.shape, 2)),
         )
 
     def control(
         self,
-        turn: ModelTurn,
+        turn: SteadyTurn,
         state: State,
         point: Float[Array, " 4"],
         curvature: Scalar,
@@ -268,38 +266,25 @@ class ModelLaw(NamedTuple):
             point: x, y, yaw, speed of the reference.
             curvature: of the path at `point` [1/m].
         """
-        steady, errors = turn.steady, path_errors(state, point, curvature)
-        back = self._recovery(turn, state, point, curvature)
-        saturated = steady.state[:3] + jnp.stack(back.errors)
-        control = steady.feedback(jnp.concatenate([saturated, state[BODY][1:]]))
-        room = turn.wheelbase * back.curvature * moving(state[3], point[3])
-        middle = steady.control[0]
-        steering = jnp.clip(control[0], middle - room, middle + room)
-        return jnp.stack([steering, control[1] - holding(errors, point[3])])
+        errors = path_errors(state, point, curvature)
+        pose = jnp.stack([errors.lateral, errors.heading])
+        control = turn.feedback(jnp.concatenate([pose, state[BODY]]))
+        return control.at[1].add(-holding(errors, point[3]))
 
     def authority(
         self,
-        turn: ModelTurn,
+        turn: SteadyTurn,
         state: State,
         point: Float[Array, " 4"],
         curvature: Scalar,
     ) -> Scalar:
         """Return the share of a perturbation that acts, see `Recovery`."""
-        return self._recovery(turn, state, point, curvature).authority
-
-    def _recovery(
-        self,
-        turn: ModelTurn,
-        state: State,
-        point: Float[Array, " 4"],
-        curvature: Scalar,
-    ) -> Recovery:
-        """The errors from ξ*: in side wind a car on its path has a heading error."""
-        errors, gain = path_errors(state, point, curvature), turn.steady.gain[0]
+        errors, gain = path_errors(state, point, curvature), turn.gain[0]
         return recovery(
-            errors._replace(heading=errors.heading - turn.steady.state[1]),
+            # From ξ*: in side wind a car on its path has a heading error.
+            errors._replace(heading=errors.heading - turn.state[1]),
             point[3],
             # Finite where there is no gain.
             slope=jnp.maximum(gain[0] / (gain[1] + 1e-6), 1e-3),
-            tightest=math.tan(FULL_LOCK) / turn.wheelbase,
-        )
+            tightest=math.tan(FULL_LOCK) / turn.grip[0],
+        ).authority
