@@ -67,7 +67,11 @@ class Recovery(NamedTuple):
 
 
 def recovery(
-    errors: PathErrors, speed: Scalar, *, slope: Scalar | float, tightest: float
+    errors: PathErrors,
+    speed: Scalar,
+    *,
+    slope: Scalar | float,
+    tightest: Scalar | float,
 ) -> Recovery:
     """Return the errors with which a linear law returns to the path from anywhere.
 
