@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from sfkd_jax.types import Scalar
+from sfkd_jax.types import Control, Scalar
 
 LATERAL_ACCELERATION = 3.0
 """That feedback may ask for far from the path [m/s²]: the grip of a wet road."""
@@ -110,14 +110,27 @@ def recovery(
 def moving(actual: Scalar, speed: Scalar) -> Scalar:
     """Return 0 at rest where the reference stands, and 1 from `CREEP` on.
 
-    Multiplies what is added to a law: at rest samples do not differ in what they do,
-    and their mean is noise.
-
     Args:
         actual: speed [m/s].
         speed: of the reference [m/s].
     """
     return jnp.clip(jnp.maximum(actual, speed) / CREEP, 0.0, 1.0)
+
+
+def admitted(nu: Control, actual: Scalar, speed: Scalar) -> Control:
+    """Return what acts of a perturbation of a law, all of it unless the car stops.
+
+    At rest samples do not differ in what they do, and their mean is noise. Where the
+    reference stands, a perturbation may brake but not drive: few models are right at
+    walking pace, and a planner with a wrong one creeps for ever.
+
+    Args:
+        nu: perturbation of steering and drive.
+        actual: speed [m/s].
+        speed: of the reference [m/s].
+    """
+    nu = nu * moving(actual, speed)
+    return jnp.where(speed == 0.0, nu.at[1].min(0.0), nu)
 
 
 def holding(errors: PathErrors, speed: Scalar) -> Scalar:

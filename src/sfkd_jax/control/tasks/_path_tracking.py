@@ -22,7 +22,7 @@ from sfkd_jax.control.laws._recovery import (
     CREEP,
     SLOW_STEERING,
     PathErrors,
-    moving,
+    admitted,
 )
 from sfkd_jax.control.tasks._task import (
     Environments,
@@ -266,6 +266,7 @@ class PathTracking(LawTask):
         """Return one step of one rollout: law, perturbation, limits, model, cost."""
         model, point = self.model, target.point
         law_control = self._law_control(before.state, target)
+        nu = admitted(nu, before.state[3], point[3])
         nu = nu * self._authority(before.state, target)
         control = self.limit(law_control + nu, before.control)
         latent = model.step(fiber, before.latent, control)
@@ -291,16 +292,14 @@ class PathTracking(LawTask):
             control = law(path_errors(state, point, curvature), curvature, point[3])
         return jnp.clip(control, *self.box())
 
-    def _authority(self, state: State, target: PathTarget) -> Scalar:
-        """The share of a perturbation that acts: not at rest, nor far from the path."""
+    def _authority(self, state: State, target: PathTarget) -> Scalar | float:
+        """The share of a perturbation that acts: none where the law has to turn."""
         point, curvature, law = target.point, target.curvature, self.law
-        share = moving(state[3], point[3])
         if isinstance(law, ModelLaw):
-            share = share * law.authority(target.turn, state, point, curvature)
+            return law.authority(target.turn, state, point, curvature)
         if isinstance(law, RecoveringFeedback):
-            errors = path_errors(state, point, curvature)
-            share = share * law.authority(errors, point[3])
-        return share
+            return law.authority(path_errors(state, point, curvature), point[3])
+        return 1.0
 
 
 path_tracking = factory(PathTracking, lambda around: around.task(check_path))
