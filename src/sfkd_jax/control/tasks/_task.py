@@ -41,8 +41,8 @@ class RolloutSetup(NamedTuple):
         context: shared by all samples and steps.
         start: state of one rollout before its first step.
         targets: data of each step; every leaf has the horizon as its leading axis.
-        followable: whether the reference is one that a plan can follow; if not, the
-            plan is that of the task's answer, and not healthy.
+        followable: whether the plan is for the reference that was given; if not, the
+            control is what the task does instead, and not healthy.
     """
 
     context: Any
