@@ -280,6 +280,7 @@ class ModelLaw(NamedTuple):
     ) -> Scalar:
         """Return the share of a perturbation that acts, see `Recovery`."""
         errors, gain = path_errors(state, point, curvature), turn.gain[0]
+        assert turn.grip is not None
         return recovery(
             # From ξ*: in side wind a car on its path has a heading error.
             errors._replace(heading=errors.heading - turn.state[1]),
