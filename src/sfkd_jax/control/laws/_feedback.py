@@ -134,6 +134,8 @@ class RecoveringFeedback(LinearFeedback):
     def _recovery(self, errors: PathErrors, speed: Scalar) -> tuple[Scalar, Recovery]:
         """How much more the law steers per distance, and its errors."""
         more = often(jnp.maximum(errors.speed + speed, speed))
+        # A car that stops does not turn towards its path in its last metre.
+        more = jnp.where(speed > 0.0, more, 1.0)
         slope = max(self.lateral_gain, 1e-6) / max(self.heading_gain, 1e-6) * more
         tightest = math.tan(FULL_LOCK) / self.wheelbase
         return more, recovery(errors, speed, slope=slope, tightest=tightest)
