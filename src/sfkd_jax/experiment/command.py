@@ -25,7 +25,7 @@ from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.experiment.options import Settings, parse_settings, register
 from sfkd_jax.experiment.runs import IDENTITY
 from sfkd_jax.settings import replace
-from sfkd_jax.store import ArtefactError
+from sfkd_jax.store import ArtefactError, print_message
 
 FAILED, INTERRUPTED = 1, 130
 OUTCOMES = {CertificationRefused: ("refused: ", 2), CertificateStale: ("stale: ", 3)}
@@ -61,19 +61,19 @@ def hydra_command(run: Run) -> Callable[[], None]:
             with threadpool_limits(1, user_api="blas"):
                 document = run(settings)
         except KeyboardInterrupt:
-            _report("interrupted; the same command continues")
+            print_message("sfkd_jax: interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
             os._exit(INTERRUPTED)
         except EXPECTED as reason:
             prefix, code = OUTCOMES.get(type(reason), ("", FAILED))
             line = next(iter(str(reason).splitlines()), type(reason).__name__)
-            _report(f"{prefix}{line}")
+            print_message(f"sfkd_jax: {prefix}{line}")
             if sweeping:  # an exit would end the jobs that follow
                 raise
             sys.exit(code)
         except Exception as reason:
             if sweeping:  # Hydra shows the first failure alone
-                _report(f"{type(reason).__name__}: {reason}")
+                print_message(f"sfkd_jax: {type(reason).__name__}: {reason}")
             raise
         print(json.dumps(document), flush=True)
         return document.get("objective")
@@ -186,7 +186,3 @@ def _name_of(overrides: list[str]) -> str:
         digest = hashlib.sha256(varied.encode()).hexdigest()[:8]
         name = f"{name[:LONGEST_NAME]}-{digest}"
     return name
-
-
-def _report(line: str) -> None:
-    print(f"sfkd_jax: {line}", file=sys.stderr, flush=True)
