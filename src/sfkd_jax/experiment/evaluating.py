@@ -51,7 +51,7 @@ class SystemResult(NamedTuple):
 
 
 def make_episodes(settings: Settings) -> EpisodeSet:
-    """Draw the episodes of a scenario; several devices share them evenly."""
+    """Draw the episodes of a scenario."""
     plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
     check_step(plant)
     family = build.build_scenario(settings.scenario, plant, duration=protocol.episode_s)
@@ -68,19 +68,7 @@ def make_episodes(settings: Settings) -> EpisodeSet:
     keys = jax.vmap(partial(jax.random.split, num=protocol.episodes))(
         jax.random.split(jax.random.key(protocol.seed))
     )
-    drawn = _shard((draw(keys[0], keys[1]), keys[1]))
-    return EpisodeSet(settings.scenario.name, *drawn)
-
-
-def _shard(batch: Any) -> Any:
-    """Distribute episodes evenly over all accelerators, if their number allows it."""
-    devices = jax.devices()
-    if jax.default_backend() == "cpu" or len(jax.tree.leaves(batch)[0]) % len(devices):
-        return batch
-    mesh = jax.sharding.Mesh(devices, ("episode",))
-    return jax.device_put(
-        batch, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("episode"))
-    )
+    return EpisodeSet(settings.scenario.name, draw(keys[0], keys[1]), keys[1])
 
 
 def _over_episodes(

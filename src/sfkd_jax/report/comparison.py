@@ -53,17 +53,13 @@ def _results(
         printed = {style.label(name): numbers for name, numbers in paper.items()}
         first.append(record_table("Printed in the paper", printed, *heads))
     sections, metrics, captions = [Section("", first)], [], []
-    for number, group in enumerate(grouped(rows, _TABLE), 1):
+    for group in grouped(rows, _TABLE):
         # One table over all vehicles and scenarios: a group shares all that is left.
         title = title_of(group, _TABLE)
-        table, parts = tables.cross_table(group, tables.rmse_cell), list[Part]()
+        table = tables.cross_table(group, tables.rmse_cell)
         if table is not None:
-            parts.append(table)
+            sections.append(Section(title, [table]))
             captions.append((f"{title}. {tables.MARKS}", table))
-        panels = grouped(group, ("vehicle", "scenario"))
-        path = style.save(images / f"rmse_{number}.png", figures.rmse_chart, panels)
-        parts.append(Picture(path, f"RMSE of every row: {title}"))
-        sections.append(Section(title, parts))
         for metric in tables.shown_metrics():
             table = tables.cross_table(group, metric.text)
             if table is not None:

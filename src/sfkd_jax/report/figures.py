@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from sfkd_jax.evaluation.formats import dig, is_number, is_pair
+from sfkd_jax.evaluation.formats import dig, is_number
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, Row
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
@@ -106,40 +106,29 @@ def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
 
 
 def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
-    """RMSE of prediction without feedback by time ahead: position, yaw, speed.
+    """Position RMSE of prediction without feedback by time ahead.
 
     `radii` are those of the certified position tube [m] by step, if there is one.
     """
-    figure = style.canvas(4.0)
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.45, 1])
-    places = grid[:, 0], grid[0, 1], grid[1, 1]
-    panels = [figure.add_subplot(one) for one in places]
+    figure = style.canvas(3.2)
+    axes = figure.subplots()
     known = is_number(errors.get("dt"))
     ahead = np.asarray(errors["steps"], float) * (errors["dt"] if known else 1.0)
     key = "position_rmse_m"
     curves = {"model": errors.get(key), "certified tube": radii}
     for name, record in (errors.get("baselines") or {}).items():
         curves[name.replace("_", " ")] = dig(record, key)
-    colours = style.ACCENT, style.DARK, "#d55e00", style.THIRD, style.SECOND, "#cc79a7"
-    dashes = "-", ":", "--", "-.", (0, (5, 1, 1, 1)), (0, (1, 1))
-    looks = zip(curves.items(), colours, dashes, strict=False)
+    colours = style.ACCENT, style.DARK, "#d55e00", style.THIRD
+    looks = zip(curves.items(), colours, ("-", ":", "--", "-."), strict=False)
     for (name, values), color, dash in looks:
         if values:
             # As floats, null is NaN: a gap in the curve.
             look = {"label": name, "color": color, "linestyle": dash}
-            panels[0].plot(ahead, np.asarray(values, float), **look)
-    names = ("position [m]", key), ("yaw [rad]", "yaw_rmse_rad")
-    names += (("speed [m/s]", "speed_rmse_m_per_s"),)
-    for axes, (name, column) in zip(panels, names, strict=True):
-        axes.set(ylabel=f"error of {name}", xlim=(0, ahead[-1]))
-        axes.set_xlabel("time ahead [s]" if known else "steps ahead")
-        if axes is not panels[0] and errors.get(column):
-            shown = np.asarray(errors[column], float)
-            axes.plot(ahead, shown, color=style.ACCENT)
-            axes.set_ylim(bottom=0.0)
-    _plain_log(panels[0].yaxis, panels[0].set_yscale)
-    style.legend(figure, panels[0])
-    figure.align_ylabels(panels[1:])
+            axes.plot(ahead, np.asarray(values, float), **look)
+    axes.set(ylabel="error of position [m]", xlim=(0, ahead[-1]))
+    axes.set_xlabel("time ahead [s]" if known else "steps ahead")
+    _plain_log(axes.yaxis, axes.set_yscale)
+    style.legend(figure, axes)
     return figure
 
 
@@ -153,35 +142,6 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
         axes.plot(*pairs.T, label=name.replace("_", " "), color=color, marker=".")
     axes.set(yscale="log", xlabel="optimisation step", ylabel="loss [-]")
     axes.legend(ncols=2)
-    return figure
-
-
-def rmse_chart(groups: list[list[Row]]) -> Figure:
-    """Mean lateral RMSE with its 95 % interval: a panel for vehicle and scenario."""
-    names = list(dict.fromkeys(name_of(row) for rows in groups for row in rows))
-    columns = min(3, len(groups))
-    deep = -(-len(groups) // columns)
-    figure = style.canvas(0.6 + deep * (0.7 + 0.2 * len(names)))
-    panels = figure.subplots(deep, columns, sharey=True, squeeze=False)
-    for axes, rows in zip(panels.flat, groups, strict=False):
-        for row in rows:
-            mean, ends = (dig(row, "rmse_m", key) for key in ("mean", "ci95"))
-            if is_number(mean):
-                height, look = names.index(name_of(row)), style.line(str(row["system"]))
-                # On a logarithmic axis an interval that reaches 0 ends at the edge.
-                low, high = ends if is_pair(ends) else (mean, mean)
-                span = [1e3 * max(low, 0.3 * mean), 1e3 * high]
-                axes.plot(span, [height] * 2, color=look["color"], linewidth=1.6)
-                axes.plot(1e3 * mean, height, "o", color=look["color"], markersize=4.5)
-        where = style.scenario_label(str(rows[0].get("scenario")))
-        words = f"{where}, {rows[0].get('vehicle')}"
-        axes.set_title(style.literal(words), fontsize=9.5)
-        axes.tick_params(labelsize=8.5)
-        _plain_log(axes.xaxis, axes.set_xscale)
-    for axes in panels.flat[len(groups) :]:
-        axes.set_axis_off()
-    _name_rows(panels[0, 0], names)
-    figure.supxlabel("lateral RMSE [mm], mean and 95 % interval", fontsize=10)
     return figure
 
 
@@ -204,15 +164,12 @@ def side_forces(rows: list[Row]) -> Figure:
         axes.scatter([], [], size, color=style.MUTED, label=f"{force:g} N")
     axes.set_xlabel("lateral RMSE [mm] by largest unmeasured side force")
     _plain_log(axes.xaxis, axes.set_xscale)
-    _name_rows(axes, [name_of(row) for row in rows])
+    names = [style.literal(name_of(row)) for row in rows]
+    axes.set_yticks(range(len(names)), names)
+    # The first above.
+    axes.set_ylim(len(names) - 0.4, -0.6)
     style.legend(figure, axes)
     return figure
-
-
-def _name_rows(axes: Any, names: list[str]) -> None:
-    """Write the names of rows beside them, the first above."""
-    axes.set_yticks(range(len(names)), [style.literal(name) for name in names])
-    axes.set_ylim(len(names) - 0.4, -0.6)
 
 
 def _plain_log(axis: Any, set_scale: Any) -> None:
