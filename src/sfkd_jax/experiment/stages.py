@@ -172,23 +172,18 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
 def _open_loop_document(
     settings: Settings, model: Model, params: Params, dataset: Dataset
 ) -> dict[str, Any]:
-    """The content of open_loop.json: errors by steps ahead, and of naive predictors."""
+    """The content of open_loop.json: errors by steps ahead, and those of bicycles."""
     along, horizon = settings.along_path is not None, settings.training.window
     plant = (
         data.closed_loop(settings) if along else build.build_vehicle(settings.vehicle)
     )
-    naive = baselines(
-        dataset.train,
-        nominal=plant.nominal,
-        dt=plant.dt,
-        horizon=horizon,
-        along_path=along,
-    )
+    about: Any = {"dt": plant.dt, "horizon": horizon, "along_path": along}
+    bicycles = baselines(dataset.train, nominal=plant.nominal, **about)
 
     @jax.jit
     def errors(params: Params, test: Trajectory) -> tuple[jax.Array, dict[str, Any]]:
         own = open_loop(model, fold(model, params), test, horizon=horizon)
-        return own, {name: predict(test) for name, predict in naive.items()}
+        return own, {name: predict(test) for name, predict in bicycles.items()}
 
     def columns(errors: jax.Array) -> dict[str, list[float]]:
         """Errors by coordinate as lists over the steps ahead."""
