@@ -102,8 +102,6 @@ def write_run(run, *, episodes=True, **changes):
         "open_loop": {
             "steps": ahead, "dt": DT, "trajectories": 320,
             "position_rmse_m": [0.001 * k**2 for k in ahead],
-            "yaw_rmse_rad": [0.001 * k for k in ahead],
-            "speed_rmse_m_per_s": [None, *[0.004 * k for k in ahead[1:]]],
             "baselines": {"kinematic_bicycle": {"position_rmse_m": [0.002 * k**2 for k in ahead]}},
         },
         "certificate": certificate(),
