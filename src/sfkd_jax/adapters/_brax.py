@@ -115,10 +115,6 @@ class BraxPlant(NamedTuple):
     The system has no pose in the plane: the first three entries of its state are 0.
 
     Attributes:
-        dt: sampling period [s].
-        state_names: pose first.
-        control_low: lower limits of the motors.
-        control_high: upper limits of the motors.
         parameters: that the entries of e scale; 1 leaves the system unchanged.
         step: (x, u, e) -> x one sampling period later, u in the units of the motors.
         start: key -> x at the start of an episode of the environment.

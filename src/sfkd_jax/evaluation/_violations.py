@@ -32,10 +32,8 @@ to 1e-6, and 20 steps add up.
 class Predictions(NamedTuple):
     """Open-loop predictions along segments, from every `STRIDE`-th true state.
 
-    Attributes:
-        errors: position [m], |yaw| [rad], body state (2-norm).
-        latent_errors: |e_k|, k = 1 … horizon.
-        defects: |d_j| of the step that leads to each of them.
+    Errors of position [m], |yaw| [rad] and body state (2-norm); |e_k|, k = 1 … horizon;
+    |d_j| of the step that leads to each of them.
     """
 
     errors: Float[Array, "segment window horizon 3"]

@@ -47,16 +47,7 @@ SWITCH = (0.05, 6.0)
 
 
 class Recording(NamedTuple):
-    """Simulated episodes as arrays; the leading axis runs over episodes.
-
-    Attributes:
-        dt: sampling period [s].
-        envs: true friction and wind.
-        lateral: signed distance of x_1 … x_T from the path [m].
-        states: x_0 … x_T.
-        controls: applied.
-        signals: recorded of every step, by name, (episode, time, …).
-    """
+    """What metrics measure: fields of `Episode` as arrays, and the true environments."""
 
     dt: float
     envs: Float[np.ndarray, "episode time environment"]

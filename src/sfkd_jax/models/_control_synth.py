@@ -24,15 +24,10 @@ also holds in float32.
 
 
 class Synthesis(NamedTuple):
-    """L s + Σ_j A_j tanh(W_j s + c_j), the M networks stacked.
+    """L s + Σ_j A_j tanh(W_j s + c_j), the M networks stacked: [A_1 … A_M], [W_1; …].
 
-    Attributes:
-        linear: L.
-        outer: [A_1 … A_M].
-        inner: [W_1; …; W_M].
-        offsets: [c_1; …; c_M].
-        metric: P, in which it contracts; None where nothing is claimed.
-        multipliers: λ of the diagonal Λ that proves it; None as well.
+    P, in which it contracts, and λ of the diagonal Λ that proves it are None where
+    nothing is claimed.
     """
 
     linear: Float[Array, "out body"]
@@ -50,14 +45,7 @@ class Synthesis(NamedTuple):
 
 
 class ControlSynthFiber(NamedTuple):
-    """The explicit matrices; e is one more input.
-
-    Attributes:
-        change: of ds/dt.
-        twist: of the output.
-        inputs: parameters of the input network.
-        env: scaled e.
-    """
+    """Matrices of ds/dt and of the output; the input network and the e that it reads."""
 
     change: Synthesis
     twist: Synthesis

@@ -19,8 +19,6 @@ class Episodes(NamedTuple):
     """The stored episodes of a row.
 
     Attributes:
-        row: its identity at least.
-        dt: sampling period [s].
         lateral: signed deviation of x_1 … x_T from the path [m], left positive.
         states: x_0 … x_T of the first episode, beginning with x, y, yaw.
         envs: friction and wind [m/s] at every step of the first episode.

@@ -115,13 +115,9 @@ class _LiftedSample(NamedTuple):
 
 
 class _LiftedTarget(NamedTuple):
-    """The reference of one step.
+    """The reference of one step, its curvature there and on average over the step [1/m].
 
-    Attributes:
-        point: x, y, yaw, speed.
-        at: curvature of the path there [1/m].
-        over: mean curvature over the step [1/m].
-        behind: distance along the path from the point to the start of the plan [m].
+    `behind` is the distance along the path from the point to the start of the plan [m].
     """
 
     point: Float[Array, "*horizon 4"]
