@@ -47,7 +47,7 @@ SWITCH = (0.05, 6.0)
 
 
 class Recording(NamedTuple):
-    """What metrics measure: fields of `Episode` as arrays, and the true environments."""
+    """What metrics measure: fields of `Episode` as arrays, and the true e."""
 
     dt: float
     envs: Float[np.ndarray, "episode time environment"]

@@ -45,7 +45,7 @@ class Synthesis(NamedTuple):
 
 
 class ControlSynthFiber(NamedTuple):
-    """Matrices of ds/dt and of the output; the input network and the e that it reads."""
+    """Matrices of ds/dt and of the output, and the network of u and the scaled e."""
 
     change: Synthesis
     twist: Synthesis

@@ -115,7 +115,7 @@ class _LiftedSample(NamedTuple):
 
 
 class _LiftedTarget(NamedTuple):
-    """The reference of one step, its curvature there and on average over the step [1/m].
+    """The reference of one step, its curvature there and averaged over the step [1/m].
 
     `behind` is the distance along the path from the point to the start of the plan [m].
     """
