@@ -249,7 +249,28 @@ def straight(columns):
     columns |= small | {"p_x": travelled, "p_y": 0.0 * travelled}
 
 
+def on_earth(write, *axes):
+    """Positions in UTM, some axes written as float32."""
+
+    def spoil(columns):
+        for axis, far in (("p_x", 5e5), ("p_y", 4.5e6)):
+            values = columns[axis] + far
+            if axis in axes:
+                values = np.asarray([float(write(np.float32(x))) for x in values])
+            columns[axis] = values
+
+    return spoil
+
+
 WRONG = {
+    "northing in float32": (
+        on_earth(float, "p_y"),
+        ", lines 2 to 302: p_y has a resolution of 0.5 m; log positions as float64",
+    ),
+    "easting in float32": (
+        on_earth("{:.2f}".format, "p_x"),
+        ", lines 2 to 302: p_x has a resolution of 0.031 m",
+    ),
     "nan": (
         change("yaw", 7, np.nan),
         ", line 9: yaw is nan; dataset.missing=drop leaves such rows out",

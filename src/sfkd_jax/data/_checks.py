@@ -37,6 +37,8 @@ STALE = 0.2
 """Share of driving rows that repeat the position of the row before, from which
 positions count as stale.
 """
+COARSEST = 0.02
+"""Resolution of positions up to which a log is used [m]."""
 AGREE = (0.8, 1.25)
 """Path length over integrated speed of a plausible log."""
 DEGREES = 9e-6
@@ -218,7 +220,7 @@ class Checks:
             )
 
     def _motion(self, log: Log) -> Iterator[Finding]:
-        """Stale positions, else jumps of position and yaw."""
+        """Stale positions, else rounded ones, else jumps of position and yaw."""
         if (stale := _stale(log)).any():
             speed, advice = log.states[1:, 3], "; log positions as often as "
             yield from _first(
@@ -227,9 +229,29 @@ class Checks:
                 lambda k: f"the position of the row before at {speed[k]:.3g} m/s",
                 hint=f"{advice}{self.columns.time}, or leave rows out",
             )
-            return
-        for find in (self._position_jumps, self._yaw_jumps):
-            yield from _first(log, *find(log))
+        elif rounded := list(self._rounded(log)):
+            yield from rounded
+        else:
+            for find in (self._position_jumps, self._yaw_jumps):
+                yield from _first(log, *find(log))
+
+    def _rounded(self, log: Log) -> Iterator[Finding]:
+        """Axes with few values, as float32 has far from the origin."""
+        speed, yaw = (log.states[:, k] for k in (3, 2))
+        driven = (0.5 * (speed[1:] + speed[:-1]) * log.waits)[log.joined]
+        for axis, part in enumerate((np.cos, np.sin)):
+            places, along = log.states[:, axis], driven * part(yaw[1:][log.joined])
+            reach = float(np.ptp(np.cumsum(along)))
+            # Of a metre, not of the way: a car takes every value of a grid only once.
+            count = len(np.unique(np.round(places % 1.0, 6) % 1.0))
+            off = float(np.std(np.diff(places)[log.joined] - along))
+            # A simulated car may move in whole metres, and is where its speed says.
+            few = count < min(1.0 / COARSEST, len(along) / 3)
+            if few and reach > 1.0 and off * count > 0.2:
+                yield Finding(
+                    f"{log.whole}: {self.columns.state[axis]} has a resolution of "
+                    f"{1 / count:.2g} m; log positions as float64, or near the origin"
+                )
 
     def _reversals(self, log: Log, chords: Chords) -> Iterator[Finding]:
         """A stretch in reverse at a speed without a sign, among others ahead."""
