@@ -304,14 +304,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the JSON object in `path`.
+    """Return the JSON object in `path`, which has `keys`.
 
-    Raises:
-        ArtefactError: the file is missing, no regular file, larger than MAX_BYTES,
-            truncated, not JSON, or lacks one of `keys`. Also refused is what two
-            readers could understand differently: a key twice in one object, NaN and
-            infinities, integers beyond 64 bits, half of a surrogate pair, and more
-            than MAX_LEVELS levels.
+    What two readers could understand differently is refused: a key twice in one object,
+    NaN and infinities, integers beyond 64 bits, half of a surrogate pair.
     """
     return _decode(path, read_bytes(path), keys=keys)
 

@@ -234,14 +234,7 @@ class DemoSettings:
 
 @takes()
 class Settings:
-    """All settings of a command.
-
-    Attributes:
-        seed: of the initial weights and the training windows.
-        name: of the run.
-        root: directory of all artefacts.
-        optimized: whether programs are compiled well; if not, fast, for trials.
-    """
+    """All settings of a command, see conf/config.yaml."""
 
     seed: NonNegativeInt
     name: Directory

@@ -38,11 +38,6 @@ def own(
         dt: sampling period [s].
         environment: whether e is used. A factory without such an argument is given the
             centre of E instead of e.
-
-    Raises:
-        ValueError: there is no such function, it fails, does not take the options, or
-            returns something else than a model; or a function of the model fails or
-            returns a state of another shape.
     """
     function = imported(factory, SETTING)
     # Somebody else's code may raise anything; a command prints one line.
