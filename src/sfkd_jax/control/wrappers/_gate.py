@@ -199,18 +199,21 @@ class Gate:
         expected, compared = state.expected, all_finite(state.expected)
         innovation = _difference(coordinates, expected)
         limit = self._limit(state, expected, periods)
-        stale = preview.repeated & (jnp.abs(expected[PATH_SPEED]) > MOVING)
-        usable = jnp.isfinite(coordinates) & readable & ~stale
-        plausible = jnp.abs(innovation) <= limit
         # The path goes on under the vehicle: an observation that is suddenly ahead or
         # behind is late, or of another place, in all of its entries.
         shifted = jnp.abs(preview.along - state.along) > self._reach(state, periods)
-        plausible &= ~shifted
+        moving = jnp.abs(expected[PATH_SPEED]) > MOVING
+        stale = (preview.repeated | shifted) & moving
+        usable = jnp.isfinite(coordinates) & readable & ~stale
+        grown = limit * (1.0 + self.growth * state.missing)
+        plausible = jnp.abs(innovation) <= grown
         # What stays implausible for so long is true: the prediction was wrong.
         late = state.missing >= round(self.patience / self.dt)
+        # But a yaw alone: the position would show it.
+        late = late.at[HEADING].set(late[HEADING] & ~plausible[LATERAL])
         measured = usable & (plausible | late | ~compared)
         # Either it or all that was believed before is wrong, and nothing says which.
-        forced = compared & jnp.any(measured & ~plausible)
+        forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
         trusted = preview.trusted & on_time & (doubt == 0) & readable & env_known
         missing = jnp.where(measured, 0, state.missing + 1)
@@ -274,7 +277,7 @@ class Gate:
             tight = 0.5 * self.share * (high - low)
             inside = state.modelled & (jnp.abs(periods - 1.0) < 1e-3)
             limit = jnp.where(inside, jnp.minimum(tight, wide), limit)
-        return limit * (1.0 + self.growth * state.missing)
+        return limit
 
     def _predict(
         self,
