@@ -3,6 +3,7 @@ words about the right cause.
 """
 
 import pickle
+from dataclasses import replace
 from functools import cache, partial
 
 import jax
@@ -56,6 +57,25 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
         control.tuned(later, temprature=1.0)
     with pytest.raises(ValueError, match="holds no state of a planner"):
         control.tuned((), elapsed=1.0)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
+    trained = load(vehicle)
+    document, text = trained.certificate, repr(trained)
+    assert len(text.splitlines()) <= 9
+    for fact in ("p_x [m]", "steering [rad] -0.5 … 0.5", "-6 … 3", "-8 … 8"):
+        assert fact in text
+    (proved,) = (line for line in text.splitlines() if "proved" in line)
+    (measured,) = (line for line in text.splitlines() if "not signed" in line)
+    assert f"alpha {document['alpha']:.4f}" in proved
+    assert f"{document['d_bar']['value']:.3g}" in measured
+    along = vehicle.endswith("_path")
+    for fact in ("v_ref [m/s] 8 … 10.5", "curvature [1/m] -0.02 … 0.02", "3 to 6 s"):
+        assert (fact in text) == along
+    if along:
+        assert f"{document['corridor']['corridor_m']:.3f} m" in measured
+    assert "nothing is proved" in repr(replace(trained, certificate=None))
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)

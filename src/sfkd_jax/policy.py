@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
@@ -39,6 +39,11 @@ _PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
 """Entries of `info` that a planner alone can give."""
 BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model that have the same size."""
+
+
+UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
+UNITS |= {"yaw": "[rad]", "yaw_rate": "[rad/s]", "steering": "[rad]"}
+"""Of the states of the vehicles of this package."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +85,77 @@ class Policy(TrainedModel):
     certificate: dict[str, Any] | None
     around: Callable[..., Controller]
 
+    @property
+    def interface(self) -> dict[str, Any]:
+        """Names, units and limits of controls, observation, e and reference."""
+        plant, box = self.vehicle, self.settings["environment"]
+        # With a speed loop the second control is what the loop is given.
+        second = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
+        names = ("steering [rad]", second)
+        # Those of logs have names of their own.
+        boxes = (self.certificate or {}).get("boxes", {})
+        columns = boxes.get("names", {}).get("env")
+        limits = zip(names, plant.control_low, plant.control_high, strict=True)
+        return {
+            "sampling_period_s": plant.dt,
+            "horizon": build.controller_horizon(self.settings["controller"]),
+            "controls": [
+                {"name": name, "low": low, "high": high} for name, low, high in limits
+            ],
+            "observation": list(plant.state_names),
+            "environment": {
+                "names": columns or ["friction [-]", "lateral wind [m/s]"],
+                "low": list(box["low"]),
+                "high": list(box["high"]),
+            },
+            "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
+        }
+
+    def __repr__(self) -> str:
+        """Say what it drives, where its certificate applies, and what is proved."""
+        known, plant = self.interface, self.vehicle
+        source = self.settings["environment"]["source"]
+        controls = zip(*(one.values() for one in known["controls"]), strict=True)
+        states = [f"{name} {UNITS.get(name, '')}".strip() for name in plant.state_names]
+        frame = "along a path" if self.model.along_path else "in the world"
+        lines = [
+            f"Policy of {plant.name} {frame}, a step of {plant.dt:g} s",
+            f"states: {', '.join(states)}",
+            f"controls: {_ranges(*controls)}",
+            f"environment, {source}: {_ranges(*known['environment'].values())}",
+            *self._certified(states[3:], known["environment"]["names"]),
+        ]
+        return "\n  ".join(lines)
+
+    def _certified(self, names: list[str], env_names: list[str]) -> Iterator[str]:
+        """Lines about the certificate: where it applies, and what of it is proved."""
+        if not (document := self.certificate):
+            yield "no certificate: nothing is proved, nothing measured"
+            return
+        boxes, corridor = document["boxes"], document.get("corridor")
+        low, high = ([*state] for state in boxes["state"])
+        if self.model.along_path:
+            names = ["e_y [m]", "e_psi [rad]", *names, "curvature [1/m]", "v_ref [m/s]"]
+            # After ν, which is the planner's.
+            for end, inputs in zip((low, high), boxes["control"], strict=True):
+                end += inputs[2:]
+        yield f"certified box: {_ranges(names, low, high)}"
+        yield f"proved: alpha {document['alpha']:.4f}, contraction of the model a step"
+        d_bar = document.get("d_bar") or {"value": float("nan")}
+        measured = f"measured, not signed: d_bar {d_bar['value']:.3g}"
+        if not corridor:
+            yield f"{measured}; no corridor"
+            return
+        share, runs = 100 * corridor["coverage"], corridor["coverage_runs"]
+        width = f"{corridor['corridor_m']:.3f} m to each side"
+        yield f"{measured}, corridor {width}, kept in {share:.1f} % of {runs} runs"
+        under = corridor["conditions"]
+        names, bend = ["speed [m/s]", *env_names], under["peak_curvature"]
+        ends = zip(under["speed"], under["env_box"], strict=True)
+        told = _ranges(names, *([speed, *corner] for speed, corner in ends))
+        dwell = "{:g} to {:g} s".format(*under["dwell_s"])
+        yield f"under: {told}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
+
     def guard(self, planner: Controller, *, along_path: bool = False) -> Controller:
         """Return any planner behind the shield of this policy, to be called like it.
 
@@ -115,6 +191,12 @@ class Policy(TrainedModel):
     def weights(self) -> Params:
         """The learned parameters as they were saved, to train on or to save again."""
         return unfold(self.params)
+
+
+def _ranges(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -> str:
+    """Names with their limits, for a person."""
+    rows = zip(names, low, high, strict=False)
+    return ", ".join(f"{name} {a:.3g} … {b:.3g}" for name, a, b in rows)
 
 
 class Request(NamedTuple):

@@ -122,7 +122,7 @@ def write_controller(
         "iree_flags": list(iree_flags) if iree else None,
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
-        **_vehicle(trained),
+        **trained.interface,
         "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(trained.weights)),
         "settings": trained.settings,
         "versions": store.versions(),
@@ -152,29 +152,6 @@ def _certificate(trained: Policy, folder: Path, policy_sha256: str) -> str | Non
     path = folder / policy.CERTIFICATE
     store.write_json(path, trained.certificate | {"policy_sha256": policy_sha256})
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _vehicle(trained: Policy) -> dict[str, Any]:
-    """Names, units and limits of controls, observation, environment and reference."""
-    plant, box = trained.vehicle, trained.settings["environment"]
-    # With a speed loop the second control is what the loop is given.
-    second = "speed command [m/s]" if plant.speed_loop else "acceleration [m/s^2]"
-    names = ("steering [rad]", second)
-    limits = zip(names, plant.control_low, plant.control_high, strict=True)
-    return {
-        "sampling_period_s": plant.dt,
-        "horizon": build.controller_horizon(trained.settings["controller"]),
-        "controls": [
-            {"name": name, "low": low, "high": high} for name, low, high in limits
-        ],
-        "observation": list(plant.state_names),
-        "environment": {
-            "names": ["friction [-]", "lateral wind [m/s]"],
-            "low": list(box["low"]),
-            "high": list(box["high"]),
-        },
-        "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
-    }
 
 
 # ---- programs
