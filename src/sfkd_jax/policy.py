@@ -9,34 +9,27 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
 from sfkd_jax import build, store
-from sfkd_jax.control import PathLaw, law_from_arrays
+from sfkd_jax.control import REQUEST, PathLaw, behind, law_from_arrays
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import (
-    Control,
     Controller,
-    ControllerInfo,
-    Environment,
     Key,
     Model,
     Params,
-    State,
 )
 
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
-_PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
-"""Entries of `info` that a planner alone can give."""
 BOXES = {"state": "body", "control": "control", "env": "env"}
 """Box of a certificate -> scales of the model that have the same size."""
 
@@ -176,12 +169,8 @@ class Policy(TrainedModel):
             )
         if along_path:
             return _entrance(self.around(planner=planner), self)
-        guard = self.around(planner=Controller(_no_request, _return_request))
-        guarded = Controller(
-            lambda key: GuardedState(planner.init(key), guard.init(key)),
-            partial(_guarded, planner, guard),
-        )
-        return _entrance(guarded, self)
+        guard = self.around(planner=REQUEST)
+        return _entrance(behind(guard, planner), self)
 
     def __reduce__(self) -> Any:
         """Refuse to be pickled; functions of a closure say less clearly why."""
@@ -197,73 +186,6 @@ def _ranges(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -
     """Names with their limits, for a person."""
     rows = zip(names, low, high, strict=False)
     return ", ".join(f"{name} {a:.3g} … {b:.3g}" for name, a, b in rows)
-
-
-class Request(NamedTuple):
-    """What a planner in the world asks for: the state of its stand-in along a path."""
-
-    control: Control
-    healthy: Bool[Array, ""]
-
-
-class GuardedState(NamedTuple):
-    """States of a planner in the world and of the guard around its `Request`."""
-
-    planner: Any
-    guard: Any
-
-
-def _no_request(key: Key) -> Request:
-    del key
-    return Request(jnp.zeros(2), jnp.asarray(True))
-
-
-def _return_request(
-    params: Params, request: Request, xi: Any, env: Any, preview: Any
-) -> tuple[Control, Request, ControllerInfo]:
-    """Act as a planner along a path that knows nothing but what was asked for."""
-    del params, env
-    unknown = jnp.asarray(jnp.nan, dtype=float)
-    states = jnp.full((preview.road.shape[0], xi.shape[0]), unknown)
-    about: Any = {
-        **dict.fromkeys(_PLANNED, unknown),
-        "healthy": request.healthy,
-        "env_inside": jnp.asarray(True),
-        "predicted_states": states,
-    }
-    return request.control, request, about
-
-
-def _guarded(
-    planner: Controller,
-    guard: Controller,
-    params: Params,
-    state: GuardedState,
-    observation: State,
-    env: Environment,
-    reference: Any,
-) -> tuple[Control, GuardedState, ControllerInfo]:
-    """Take one control step of a planner in the world behind a guard along the path."""
-    inputs = observation, env, reference
-    planned, memory, about = planner.act(params, state.planner, *inputs)
-    planned = jnp.asarray(planned, dtype=float)
-    if planned.shape != (2,):
-        raise ValueError(f"the planner's control has shape {planned.shape}, not (2,)")
-    healthy = jnp.all(jnp.isfinite(planned)) & about.get("healthy", True)
-
-    # Projection loses the pose in the world that the planner needs, so it acts before:
-    # its request lies in the state of the stand-in, at whatever depth.
-    def is_request(node: Any) -> bool:
-        return isinstance(node, Request)
-
-    def put(node: Any) -> Any:
-        return Request(planned, healthy) if is_request(node) else node
-
-    asked = jax.tree.map(put, state.guard, is_leaf=is_request)
-    control, after, info = guard.act(params, asked, *inputs)
-    known = {name: about[name] for name in _PLANNED if name in about}
-    merged: Any = {**about, **info, **known}
-    return control, GuardedState(memory, after), merged
 
 
 def save(

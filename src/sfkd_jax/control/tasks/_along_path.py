@@ -272,3 +272,76 @@ def _check(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
             f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "
             f"got {preview.road.shape[0]} steps"
         )
+
+
+class Request(NamedTuple):
+    """What a planner in the world asks for: the state of its stand-in along a path."""
+
+    control: Control
+    healthy: Bool[Array, ""]
+
+
+class BehindState(NamedTuple):
+    """States of a planner in the world, and of the guard around its `Request`."""
+
+    planner: Any
+    guard: Any
+
+
+PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
+"""Entries of `info` that a planner alone can give."""
+
+
+def _ask(
+    params: Params, request: Request, xi: PathState, env: Environment, preview: Preview
+) -> tuple[Control, Request, ControllerInfo]:
+    unknown = jnp.asarray(jnp.nan, dtype=float)
+    about: Any = {
+        **dict.fromkeys(PLANNED, unknown),
+        "healthy": request.healthy,
+        "env_inside": jnp.asarray(True),
+        "predicted_states": jnp.full((preview.road.shape[0], xi.shape[0]), unknown),
+    }
+    return request.control, request, about
+
+
+REQUEST = Controller(lambda key: Request(jnp.zeros(2), jnp.asarray(True)), _ask)
+"""A controller along a path that asks for what its state says, see `behind`."""
+
+
+def behind(guard: Controller, planner: Controller) -> Controller:
+    """Return a planner that sees the world behind a guard that sees the path.
+
+    Args:
+        guard: in the world, with `REQUEST` in it at any depth.
+        planner: any; entries of its `info` appear in that of the guard.
+
+    Raises:
+        ValueError: (when called) the planner's control is not that of a vehicle.
+    """
+
+    def is_request(node: Any) -> bool:
+        return isinstance(node, Request)
+
+    def act(
+        params: Params, state: BehindState, observation: Any, env: Any, reference: Any
+    ) -> tuple[Control, BehindState, ControllerInfo]:
+        # Before the projection, which loses the pose that the planner needs; what it
+        # asks for travels in the state, past whatever wrapper is between.
+        inputs = observation, env, reference
+        planned, memory, about = planner.act(params, state.planner, *inputs)
+        planned = jnp.asarray(planned, dtype=float)
+        if planned.shape != (2,):
+            raise ValueError(f"a planner's control has shape (2,), got {planned.shape}")
+        request = Request(planned, all_finite(planned) & about.get("healthy", True))
+        asked = jax.tree.map(
+            lambda node: request if is_request(node) else node,
+            state.guard,
+            is_leaf=is_request,
+        )
+        control, after, info = guard.act(params, asked, *inputs)
+        known = {name: about[name] for name in PLANNED if name in about}
+        merged: Any = {**about, **info, **known}
+        return control, BehindState(memory, after), merged
+
+    return Controller(lambda key: BehindState(planner.init(key), guard.init(key)), act)
