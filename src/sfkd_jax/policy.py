@@ -244,7 +244,9 @@ def restore(path: str | Path) -> TrainedModel:
     # Before anything is built: building imports and calls what the settings name.
     with store.as_artefact_error(file, ValueError):
         build.check_imported(settings)
-    with store.as_artefact_error(file, ValueError, advice=_advice(manifest)):
+    version = manifest["versions"].get("sfkd_jax")
+    advice = f"saved by sfkd_jax {version}: train again"
+    with store.as_artefact_error(file, ValueError, advice=advice):
         parts = {name: settings[name] for name in ("vehicle", "space", "model")}
         vehicle, model = _build(json.dumps(parts))
         # Settings of a wrong type fail only here.
@@ -438,11 +440,6 @@ def _file(path: str | Path) -> Path:
     """Return policy.safetensors of a run directory, or the file itself."""
     named = Path(path).suffix == store.SUFFIX
     return Path(path) if named else Path(path) / "policy.safetensors"
-
-
-def _advice(manifest: Values) -> str:
-    """What to do about a file that this version does not understand."""
-    return f"saved by sfkd_jax {manifest['versions'].get('sfkd_jax')}: train again"
 
 
 def _weights(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Params:
