@@ -108,12 +108,7 @@ def recovery(
 
 
 def moving(actual: Scalar, speed: Scalar) -> Scalar:
-    """Return 0 at rest where the reference stands, and 1 from `CREEP` on.
-
-    Args:
-        actual: speed [m/s].
-        speed: of the reference [m/s].
-    """
+    """Return 0 at rest where the reference stands, and 1 from `CREEP` on."""
     return jnp.clip(jnp.maximum(actual, speed) / CREEP, 0.0, 1.0)
 
 
@@ -123,11 +118,6 @@ def admitted(nu: Control, actual: Scalar, speed: Scalar) -> Control:
     At rest samples do not differ in what they do, and their mean is noise. Where the
     reference stands, a perturbation may brake but not drive: few models are right at
     walking pace, and a planner with a wrong one creeps for ever.
-
-    Args:
-        nu: perturbation of steering and drive.
-        actual: speed [m/s].
-        speed: of the reference [m/s].
     """
     nu = nu * moving(actual, speed)
     return jnp.where(speed == 0.0, nu.at[1].min(0.0), nu)
@@ -138,10 +128,6 @@ def holding(errors: PathErrors, speed: Scalar) -> Scalar:
 
     0 unless the reference stands. Proportional up to 0.1 m/s: a vehicle that can
     reverse does not.
-
-    Args:
-        errors: of the state.
-        speed: of the reference [m/s].
     """
     brake = HOLDING * jnp.clip(10.0 * (errors.speed + speed), -1.0, 1.0)
     return jnp.where(speed == 0.0, brake, 0.0)
@@ -151,10 +137,8 @@ def often(pace: Scalar) -> Scalar:
     """Return how much more a law steers per distance at low speed; 1 from 5 m/s on.
 
     Below, errors decay over a time, as at 5 m/s: at 0.3 m/s a car takes 30 s for the
-    9 m over which a linear law comes back.
-
-    Args:
-        pace: speed of the car, or of the reference if that is higher [m/s].
+    9 m over which a linear law comes back. `pace` is the speed of the car, or of the
+    reference if that is higher [m/s].
     """
     # 1.4/v − 0.4 instead of 1/v: the slower the car, the more it is at full lock.
     return jnp.maximum(1.4 * SLOW_STEERING / jnp.maximum(pace, CREEP) - 0.4, 1.0)
