@@ -77,10 +77,6 @@ def relative(observation: Places, reference: Places) -> tuple[Places, Places, Pl
 
     For positions on Earth in double precision, outside `jax.jit`, which rounds its
     arguments. Nothing changes within 1 km of the origin, and for float32.
-
-    Args:
-        observation: p_x, p_y, yaw, v, ….
-        reference: x, y, yaw, speed of each step.
     """
     given = (observation, reference)
     if any(one.dtype.itemsize < 8 for one in given):

@@ -39,13 +39,6 @@ class GymnasiumVehicle(gymnasium.Env):
     if the car leaves the lane and truncated at the end of the road. The same seed gives
     the same road, friction and wind; `reset` without a seed gives the next of the
     stream that the last seed began.
-
-    Args:
-        render_mode: "rgb_array" for images, "human" for a window, or None.
-        settings: of `DrivingTask`.
-
-    Raises:
-        ValueError: an unknown render mode, or as `DrivingTask`.
     """
 
     metadata = {"render_modes": list(MODES), "render_fps": 10}  # noqa: RUF012
@@ -91,11 +84,7 @@ class GymnasiumVehicle(gymnasium.Env):
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Simulate one sampling period.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
+        """Simulate one sampling period."""
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         road, moment = self._now
@@ -147,12 +136,7 @@ class GymnasiumVehicle(gymnasium.Env):
 
 
 class _RoadView:
-    """A view of path, lane, car and deviation that follows the car.
-
-    Args:
-        task: whose lane and sampling period are drawn.
-        human: whether to show a window; otherwise frames are images only.
-    """
+    """A view of path, lane, car and deviation that follows the car."""
 
     def __init__(self, task: DrivingTask, *, human: bool) -> None:
         from matplotlib import pyplot

@@ -73,11 +73,6 @@ def write_controller(
         platforms: that the programs are compiled for.
         iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
-
-    Raises:
-        ValueError: unknown platform, a controller that cannot be exported, or IREE
-            missing or failing.
-        ArtefactError: the folder is not writable.
     """
     if not platforms or not set(platforms) <= set(PLATFORMS):
         raise ValueError(
@@ -166,10 +161,6 @@ def flat_programs(trained: Policy) -> dict[str, Program]:
 
     Names are paths, such as `state.plan` and `info.cost`. Keys are passed as their
     uint32 data.
-
-    Raises:
-        ValueError: the controller's state changes its structure, shapes or dtypes from
-            step to step.
     """
     init, act = trained.controller
     key, state, *measured = _example_inputs(trained)
@@ -254,10 +245,7 @@ def _named(root: str, tree: Any) -> tuple[Leaf, ...]:
 def _compile_iree(stablehlo: str, flags: Sequence[str]) -> bytes:
     """Return an IREE module (.vmfb) for CPUs, with the function `main`.
 
-    Raises:
-        ValueError: IREE is not installed, or does not compile this program, with its
-            first error. It has no LAPACK, so it refuses factorisations in a control
-            step: those of `koopman_mpc` and of ControlSynth's metric.
+    IREE has no LAPACK: it refuses `koopman_mpc` and ControlSynth, which factorise.
     """
     try:
         from iree import compiler  # pyright: ignore[reportMissingImports]
@@ -285,11 +273,7 @@ def warm_up(trained: Policy) -> jax.stages.Compiled:
 
     With JAX_COMPILATION_CACHE_DIR set, later processes load the machine code.
 
-    Args:
-        trained: as `load` returns it.
-
-    Returns:
-        The compiled function, for float32 arrays of the policy's shapes only.
+    It takes float32 arrays of the policy's shapes only.
     """
     _, state, *measured = _example_inputs(trained)
     act = jax.jit(trained.controller.act)

@@ -62,15 +62,7 @@ class ExportedController:
     """
 
     def __init__(self, folder: str | Path = Path(__file__).parent) -> None:
-        """Read and compile the programs.
-
-        Args:
-            folder: of the export.
-
-        Raises:
-            ExportError: a file is missing, no regular file, truncated, changed,
-                malformed, or made for another jax or platform.
-        """
+        """Read and compile the programs, or raise an ExportError with the reason."""
         path = Path(folder) / "controller.json"
         try:
             self.manifest = _manifest(path)
@@ -109,10 +101,6 @@ class ExportedController:
             env: (friction [-], lateral wind [m/s]).
             reference: (horizon, 4): x, y, yaw, speed at the next steps.
             elapsed: sampling periods since the last call; None for one.
-
-        Raises:
-            ValueError: an argument of the wrong shape, or a state of another
-                controller.
         """
         measured = {"observation": observation, "env": env, "reference": reference}
         given = {f"state.{name}": value for name, value in state.items()} | {
@@ -130,15 +118,13 @@ class ExportedController:
                     f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
                     f"got {value.shape}"
                 )
-        places = [given[name] for name in ("observation", "reference")]
+        places = {name: given[name] for name in ("observation", "reference")}
         origin = np.zeros(2)
         # As `sfkd_jax.relative`: before the cast, and never of what was float32 before.
-        if min(place.dtype.itemsize for place in places) == 8:
-            near = np.nan_to_num(places[1][0, :2], posinf=0.0, neginf=0.0)
+        if min(place.dtype.itemsize for place in places.values()) == 8:
+            near = np.nan_to_num(places["reference"][0, :2], posinf=0.0, neginf=0.0)
             origin = CELL * np.round(near / CELL)
-            given["observation"], given["reference"] = (
-                _shifted(place, -origin) for place in places
-            )
+            given |= {name: _shifted(place, -origin) for name, place in places.items()}
         for name in given:
             if name in measured:
                 given[name] = given[name].astype(np.float32)
