@@ -521,7 +521,6 @@ def test_who_is_blind_for_good_brakes():
     xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=170)
     assert not np.any(info["healthy"][40:])
     # The toy's law wants back to the old speed; the car slows down all the same.
-    assert np.all(np.diff(xi[65:, 2]) < 0.0)
     assert xi[-1, 2] < 6.0
 
 

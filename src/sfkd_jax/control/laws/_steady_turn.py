@@ -28,19 +28,19 @@ than any model sees. Who turns hard must not accelerate hard as well.
 """
 # The approach, chosen by a random search on both benchmark cars: how soon how many of
 # 420 starts and of 2500 random ones are back. All lengths and times scale with the law.
-ARC, CORNERING, SHARED = 0.552, 1.08, 0.6
+ARC, CORNERING, SHARED = 0.56, 0.95, 0.55
 """Shares of the grip that arc, steering and the turn's part of the circle may use."""
-STEEPEST, TURN = 1.5, 1.17
+STEEPEST, TURN = 1.5, 1.2
 """Largest angle of approach and largest heading error that is fed back [rad]."""
-DAMPING = 2.0
+DAMPING = 2.2
 """Of the rates of the body, relative to the linear law."""
-CIRCLE = 4.1
+CIRCLE = 2.8
 """Radius of the tightest turn, relative to d steering / d curvature."""
-SLOWER, DISTANT = (0.215, 1.42), (1.7, 13.4)
+SLOWER, DISTANT = (0.2, 1.0), (1.9, 14.0)
 """Heading error [rad] and |e_y| [m] from which on the vehicle slows down, and over
 which it reaches its lowest speed.
 """
-FASTER, BRAKING = 0.545, 1.165
+FASTER, BRAKING = 0.5, 1.2
 """Largest differences of speed [m/s] that are fed back."""
 
 Derivative: TypeAlias = Callable[[Callable[[Array], Array], Array], tuple[Array, Array]]
