@@ -10,6 +10,7 @@ import pytest
 
 from sfkd_jax import __main__ as program
 from sfkd_jax import __version__
+from sfkd_jax.experiment.command import hydra_command
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = """
@@ -78,6 +79,7 @@ def test_an_unknown_command_is_one_line(monkeypatch):
 @pytest.mark.parametrize(
     ("argument", "status", "line"),
     [
+        ("root=Größe", 1, "sfkd_jax: root=Größe: quote the value, 'root=\"Größe\"'"),
         ("seed=1", 1, "sfkd_jax: a job that cannot be done"),
         ("seed=2", 2, "sfkd_jax: refused: not below 1"),
         ("training.batch=0", 1, "sfkd_jax: training.batch must be in [1, inf), got 0"),
@@ -88,6 +90,16 @@ def test_an_expected_error_is_one_line_and_an_exit_code(toy, argument, status, l
     assert done.returncode == status
     assert done.stderr.strip().splitlines() == [line]
     assert printed(done) == []
+
+
+def test_a_directory_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    with pytest.raises(SystemExit, match="1"):
+        hydra_command(dict)()
+    assert "this directory was deleted: change to one" in capsys.readouterr().err
+    monkeypatch.undo()
+    tmp_path.mkdir()
 
 
 def test_a_failed_job_of_a_sweep_does_not_lose_the_results_of_the_others(toy):

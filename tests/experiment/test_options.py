@@ -87,6 +87,10 @@ def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
         settings(*overrides)
 
 
+def test_a_root_may_begin_at_home():
+    assert settings("root='~/x'").root == str(Path.home() / "x")
+
+
 def test_without_an_environment_no_model_reads_one():
     assert settings().model.environment
     assert not settings("environment=none").model.environment

@@ -9,6 +9,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from typing import Any
 import hydra
 import jax
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
@@ -78,9 +81,39 @@ def hydra_command(run: Run) -> Callable[[], None]:
         print(json.dumps(document), flush=True)
         return document.get("objective")
 
-    return hydra.main(
+    composing = hydra.main(
         config_path=conf_path(), config_name="config", version_base="1.3"
     )(main)
+
+    def command() -> None:
+        if reason := _unusable(sys.argv[1:]):
+            _report(reason)
+            sys.exit(FAILED)
+        composing()
+
+    return command
+
+
+def _unusable(words: list[str]) -> str | None:
+    """Why Hydra would end in a traceback, or in a word of its grammar."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return "this directory was deleted: change to one that exists"
+    parser = OverridesParser.create()
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not equals or word.startswith("-") or value.startswith(("[", "{")):
+            continue
+        quoted = f'{name}="{value}"'
+        try:
+            parser.parse_override(word)
+        except HydraException:
+            # Letters beyond ASCII, ~ and = inside a value; other faults are Hydra's.
+            with suppress(HydraException):
+                parser.parse_override(quoted)
+                return f"{word}: quote the value, '{quoted}'"
+    return None
 
 
 def conf_path() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import field, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -297,11 +298,13 @@ def parse_settings(values: Values) -> Settings:
             f"environment that varies: {why}; pass environment.source=measured or none"
         )
     model = replace(settings.model, environment=reads and environment.is_known)
-    return replace(settings, model=model)
+    root = str(Path(settings.root).expanduser())
+    return replace(settings, model=model, root=root)
 
 
 def register() -> None:
     """Put the dataclasses of all groups into Hydra's store, as schemas."""
+    OmegaConf.register_new_resolver("home", os.path.expanduser, replace=True)
     datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
     variants: dict[str, Any] = {
         "vehicle": build.VEHICLES,
