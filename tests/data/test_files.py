@@ -301,7 +301,7 @@ WRONG = {
     ),
     "unsigned": (
         unsigned,
-        "the robot moves against its yaw at a positive v (14",
+        "the robot moves against the sign of v (14",
     ),
     "late positions": (
         late(("p_x", "p_y"), 3),

@@ -266,8 +266,8 @@ class Checks:
             if opposite[rows[0]] and len(rows) > least and (off < 0.5).sum() > least:
                 yield Finding(
                     f"{log.between(int(rows[0]), int(rows[-1]))}: the robot moves "
-                    f"against its yaw at a positive {self.columns.state[3]}"
-                    f"{more(opposite)}; make it negative where the robot reverses"
+                    f"against the sign of {self.columns.state[3]}{more(opposite)}; "
+                    "it is negative where the robot reverses"
                 )
                 return
 

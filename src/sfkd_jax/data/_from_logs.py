@@ -100,19 +100,18 @@ def from_logs(
         ValueError: the first reason why the logs are refused; the others are reported.
     """
     check_choice("dataset.missing", missing, ("refuse", "drop"))
-    drop = missing == "drop"
     # All files are read and checked before any is refused: one run shows all faults.
     recorded, errors, conversions = read_logs(
         log_files(path).values(),
         columns,
         dt=dt,
         needs_environment=needs_environment,
-        blanks=drop,
+        blanks=missing == "drop",
     )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
     box = (env_low, env_high) if needs_environment else (None, None)
-    cuts = (gap, min_speed, split_at_jumps, drop)
+    cuts = (gap, min_speed, split_at_jumps, missing == "drop")
     checks = Checks(columns, dt, steps, wheelbase, *cuts, limits, box)
     logs, findings = checks.apply(recorded)
     if logs:

@@ -87,7 +87,7 @@ def hydra_command(run: Run) -> Callable[[], None]:
 
     def command() -> None:
         if reason := _unusable(sys.argv[1:]):
-            _report(reason)
+            print_message(f"sfkd_jax: {reason}")
             sys.exit(FAILED)
         composing()
 
