@@ -60,6 +60,7 @@ def exported(tmp_path_factory):
         jax.random.key(0)
     )
     stored = parsing.plain(requested) | {"space": build.space_to_settings(space())}
+    stored["dataset"] |= {"segments": 120, "shares": SHARES}
     runs.claim(requested)
     run_dir = requested.run_dir
     policy.save(
@@ -69,14 +70,15 @@ def exported(tmp_path_factory):
     splits = {
         "validation": data.validation,
         "calibration": data.calibration,
-        "held_out": {"test": data.test},
+        "held_out": dict.fromkeys(("test", "uniform", "s3"), data.test),
     }
     certificate = certification.issue(
         trained.model, trained.params, **splits, boxes=BOXES, level=0.9, attack_starts=0
     )
-    store.write_json(
-        run_dir / "certificate.json", certificate | {"policy_sha256": trained.sha256}
-    )
+    certificate["versions"] |= store.versions()
+    certificate["weights_sha256"] = trained.weights_sha256
+    certificate["policy_sha256"] = trained.sha256
+    store.write_json(run_dir / "certificate.json", certificate)
     return requested, export.run(requested)
 
 

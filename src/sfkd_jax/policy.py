@@ -30,8 +30,6 @@ from sfkd_jax.types import (
 
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
-BOXES = {"state": "body", "control": "control", "env": "env"}
-"""Box of a certificate -> scales of the model that have the same size."""
 
 
 UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
@@ -249,18 +247,17 @@ def restore(path: str | Path) -> TrainedModel:
     with store.as_artefact_error(file, ValueError, advice=advice):
         parts = {name: settings[name] for name in ("vehicle", "space", "model")}
         vehicle, model = _build(json.dumps(parts))
-        # Settings of a wrong type fail only here.
-        shapes = jax.eval_shape(model.init, jax.random.key(0))
+        # Settings of a wrong type fail only here. Weights are float32 in any process.
+        with jax.enable_x64(False):
+            shapes = jax.eval_shape(model.init, jax.random.key(0))
         for name, leaf in arrays.items():
             if not np.all(np.isfinite(leaf)):
                 raise store.ArtefactError(f"{file}: weights {name} are not finite")
-        law = None
-        if model.along_path:
-            # What is left without the law are the weights, compared name by name.
-            names = [name for name in arrays if name.startswith(f"{LAW}/")]
-            law = law_from_arrays(
-                {name.removeprefix(f"{LAW}/"): arrays.pop(name) for name in names}
-            )
+        # What is left without the law are the weights, compared name by name.
+        names = [name for name in arrays if name.startswith(f"{LAW}/")]
+        tables = {name.removeprefix(f"{LAW}/"): arrays.pop(name) for name in names}
+        build.check_consistent(settings, vehicle, tables if model.along_path else None)
+        law = law_from_arrays(tables) if model.along_path else None
     return TrainedModel(
         model=model,
         params=_weights(file, arrays, shapes),
@@ -306,6 +303,14 @@ def load(
         box = trained.settings["environment"] | {"source": env_source}
         settings = {**trained.settings, "environment": box}
         settings["controller"] = controller or trained.settings["controller"]
+        shielded = settings["controller"].get("shield")
+    # Never the same planner without its shield, unless the caller says so.
+    if shielded and not (certificate or {}).get("corridor"):
+        raise store.ArtefactError(
+            f"{file}: controller.shield needs a certified corridor, and "
+            f"{reason or 'the certificate has none'}; run certify, or load it with "
+            "controller=... and shield=False"
+        )
     # What a model reads must come from somewhere; what it does not is not estimated.
     sources = [s for s in build.ENV_SOURCES if s != ("none" if reads else "estimated")]
     if env_source not in sources:
@@ -410,19 +415,11 @@ def read_certificate(
         return None, f"the certificate was refused: {reason}"
     try:
         with store.as_artefact_error(file):
-            bound = {"model": trained.model, "policy_sha256": trained.sha256}
-            certification.verify_document(document, trained.params, **bound)
+            certification.verify_document(document, trained)
     except certification.CertificateStale as reason:
         return None, f"{reason}; certify again"
     except certification.CertificationRefused as reason:
         raise store.ArtefactError(f"{file}: {reason}") from None
-    space, boxes = trained.settings["space"], document["boxes"]
-    # A box of another size would broadcast over the state unnoticed.
-    for name, part in BOXES.items():
-        if len(boxes[name][0]) != len(space[f"{part}_mean"]):
-            raise store.ArtefactError(
-                f"{file}: boxes.{name} is of another size than the model"
-            )
     return document, ""
 
 

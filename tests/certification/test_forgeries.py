@@ -14,7 +14,6 @@ from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
     _certificate,
-    _verification,
 )
 from sfkd_jax.certification._claims import (
     CONSTANTS,
@@ -191,8 +190,7 @@ def served(monkeypatch):
     attacks = {"step": 0.2, "transport": 1.0}
     proved = lambda weights: chosen.claims or honest()
     monkeypatch.setattr(_certificate, "prove", proved)
-    for module in (_certificate, _verification):
-        monkeypatch.setattr(module, "exported", lambda *_: chosen.weights)
+    monkeypatch.setattr(_certificate, "exported", lambda *_: chosen.weights)
     monkeypatch.setattr(_certificate, "attack_claims", lambda *_: dict(attacks))
     return chosen
 
@@ -202,7 +200,7 @@ def certified(**settings):
 
 
 def verified(certificate, params=PARAMS):
-    inspect.unwrap(_verification.verify)(certificate, params, model=MODEL)
+    inspect.unwrap(_certificate.verify)(certificate, params, model=MODEL)
 
 
 def test_a_certificate_verifies_and_survives_json(served):
@@ -256,7 +254,7 @@ def test_other_weights_are_not_covered(served):
         ("attack or tightness", {"attack": np.nan}),
         ("attack or tightness", {"tightness": 1.0}),
         ("attack or tightness", {"attacks": {}}),
-        ("malformed", {"witnesses": {}}),
+        ("lacks 'residual'", {"witnesses": {}}),
         ("malformed", {"witnesses": {"residual": 3, "joint": None}}),
     ],
 )

@@ -6,6 +6,7 @@ Every function takes an object of settings, or plain values that are parsed into
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -22,6 +23,7 @@ from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
 from sfkd_jax.data import Driver
+from sfkd_jax.geometry import PATH_SPEED
 from sfkd_jax.ranges import Positive
 from sfkd_jax.settings import (
     BelowRoot,
@@ -194,6 +196,65 @@ def check_imported(settings: Any) -> None:
         raise ValueError(
             f"its model is {factory}: import {module} first, if you trust it"
         )
+
+
+def check_consistent(
+    settings: Values, vehicle: plants.Vehicle, law: Mapping[str, Any] | None
+) -> None:
+    """Raise a ValueError if settings of a policy contradict each other or its law.
+
+    Args:
+        settings: of the policy.
+        vehicle: of the settings.
+        law: tables of a policy along a path, as numpy arrays, or None.
+    """
+    space, data = settings["space"], settings.get("dataset", {})
+    for name, values in space.items():
+        # No channel has a smaller scale: one that never moves has 1.
+        least = 1e-6 if name.endswith("scale") else -math.inf
+        if not all(least < value < math.inf for value in values):
+            raise ValueError(f"its space.{name} = {values} is out of range")
+    if law is not None:
+        _check_law(settings, vehicle, law)
+    elif "segments" in data:
+        # Simulated runs never stop: a mean step is about as long as at the centre of v.
+        length = space["body_mean"][0] * vehicle.dt
+        if not 0.5 < space["increment_mean"][0] / length < 2.0:
+            raise ValueError(f"its vehicle.dt = {vehicle.dt} is not that of its data")
+
+
+def _check_law(
+    settings: Values, vehicle: plants.Vehicle, law: Mapping[str, Any]
+) -> None:
+    """Raise a ValueError unless the tables of a law are those of the settings."""
+    space, box = settings["space"], settings["environment"]
+    size, axes = len(space["body_mean"]), 2 + len(space["env_mean"])
+    grid = law["control"].shape[:-1]
+    shapes = {"low": (axes,), "high": (axes,), "perturbation": (2,)}
+    shapes |= {"state": (*grid, size), "control": (*grid, 2), "gain": (*grid, 2, size)}
+    found = {name: table.shape for name, table in law.items()}
+    if found != shapes or len(grid) != axes or min(grid) < 2:
+        raise ValueError(f"its law has tables of shapes {found}, not of one grid")
+    if (law["low"] >= law["high"]).any() or (law["perturbation"] <= 0).any():
+        raise ValueError("its law has an axis without width, or no perturbation")
+    # Of a law from elsewhere nothing more is known.
+    if (asked := settings.get("dataset", {}).get("law")) is None:
+        return
+    side, (slow, fast) = asked["lateral_acceleration"], asked["speed"]
+    ends = {"low": (-side, slow, *box["low"]), "high": (side, fast, *box["high"])}
+    for name, wanted in {**ends, "perturbation": asked["perturbation"]}.items():
+        if not jnp.allclose(law[name], jnp.asarray(wanted), rtol=1e-6, atol=0.0):
+            raise ValueError(f"its law has {name} {law[name]}, its settings {wanted}")
+    # The second control of an own vehicle may be anything.
+    if settings["vehicle"]["name"] == "own" or vehicle.speed_loop:
+        return
+    # The speed is the integral of the acceleration, so that the linear regulator has a
+    # gain in closed form, which tells the sampling period.
+    dt, weight, effort = vehicle.dt, asked["velocity"], asked["drive"]
+    cost = 0.5 * (weight + math.sqrt(weight**2 + 4.0 * weight * effort / dt**2))
+    gain = float(law["gain"][grid[0] // 2, ..., 1, PATH_SPEED].mean())
+    if not 0.95 < gain * (effort + dt**2 * cost) / (dt * cost) < 1.05:
+        raise ValueError(f"its vehicle.dt = {dt} is not that of its law")
 
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:

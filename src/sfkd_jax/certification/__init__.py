@@ -13,6 +13,7 @@ from sfkd_jax.certification._certificate import (
     contraction_metrics as contraction_metrics,
 )
 from sfkd_jax.certification._certificate import issue as issue
+from sfkd_jax.certification._certificate import verify as verify
 from sfkd_jax.certification._claims import OutputMetric as OutputMetric
 from sfkd_jax.certification._core import check_metric as check_metric
 from sfkd_jax.certification._core import check_vertices as check_vertices
@@ -21,7 +22,6 @@ from sfkd_jax.certification._core import is_positive_definite as is_positive_def
 from sfkd_jax.certification._core import norm_upper as norm_upper
 from sfkd_jax.certification._search import lipschitz_upper as lipschitz_upper
 from sfkd_jax.certification._tubes import latent_tube as latent_tube
-from sfkd_jax.certification._verification import verify as verify
 from sfkd_jax.certification._verification import verify_document as verify_document
 from sfkd_jax.certification._weights import CertificateStale as CertificateStale
 from sfkd_jax.certification._weights import CertificationRefused as CertificationRefused

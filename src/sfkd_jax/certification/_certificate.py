@@ -13,24 +13,35 @@ import jax
 import numpy as np
 
 from sfkd_jax.certification._attack import attack_claims
-from sfkd_jax.certification._claims import Box, Claims, keeps_metrics, require_box
+from sfkd_jax.certification._claims import (
+    FLOAT32,
+    Box,
+    Claims,
+    attack_limits,
+    keeps_metrics,
+    require_box,
+    require_claims,
+)
 from sfkd_jax.certification._measured import (
     KINDS,
     Residuals,
     conformal_bounds,
     coverage,
+    holds_for,
     residuals,
-    supports,
 )
 from sfkd_jax.certification._metrics import prove_lyapunov
 from sfkd_jax.certification._search import joint_bound, prove
 from sfkd_jax.certification._tubes import output_tubes, tubes
 from sfkd_jax.certification._weights import (
+    CertificateStale,
     CertificationRefused,
+    Exported,
     exported,
     fingerprint,
     one_thread,
     require,
+    well_formed,
 )
 from sfkd_jax.ranges import Fraction, NonNegativeInt
 from sfkd_jax.rollout import fold
@@ -124,6 +135,56 @@ def certify(
         versions={name: version(name) for name in ("jax", "numpy", "scipy")},
         seconds=time.perf_counter() - began,
     )
+
+
+def verify(
+    certificate: Certificate,
+    params: Params,
+    *,
+    model: Model,
+    weights: Exported | None = None,
+) -> None:
+    """Check a certificate against weights without any search.
+
+    Takes milliseconds once `model.structure.explicit` is compiled.
+
+    Args:
+        certificate: from an untrusted source.
+        params: the weights.
+        model: that they belong to.
+        weights: explicit weights of `params`, if already computed.
+
+    Raises:
+        CertificateStale: it is about other weights.
+        CertificationRefused: a claim does not follow from its witness.
+    """
+    # First the hash: a proof about other weights need not be read at all.
+    if fingerprint(params) != certificate.params_sha256:
+        raise CertificateStale("the certificate is about other weights")
+    weights = exported(model, params) if weights is None else weights
+    with well_formed(), one_thread():
+        require_claims(certificate, weights, certificate.env_box)
+        alpha, limits = certificate.alpha, attack_limits(certificate, weights)
+        require(
+            alpha < 1.0 and certificate.transport_lipschitz == 1.0,
+            f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
+        )
+        # A text that promises more than these checks cover must not pass.
+        covered = certificate.precision == PRECISION
+        require(covered, "precision is not what is covered")
+        for name, value in certificate.attacks.items():
+            limit = limits.get(name)
+            # An attack above the proved bound would contradict the document itself.
+            require(
+                limit is not None and 0 <= value <= limit * (1 + FLOAT32),
+                f"the attack {name} = {value!r} contradicts the bound {limit}",
+            )
+        step = certificate.attacks.get("step")
+        tightness = alpha / step if step else None
+        require(
+            certificate.attack == step and certificate.tightness == tightness,
+            "attack or tightness does not follow from the attacks",
+        )
 
 
 @one_thread()
@@ -242,16 +303,14 @@ def _one_step_bounds(
         for name, part in unseen.items()
     }
     one_step = dict(zip(KINDS, bounds.tolist(), strict=True))
-    independent, holds_for = runs.get("calibration", len(scores)), "new runs like these"
-    # Too few runs: the bound is then about these runs, and the text says so.
-    if not supports(independent, level):
-        holds_for = f"further segments of the same {independent} runs"
+    independent = runs.get("calibration", len(scores))
     return {
         "value": one_step["latent"],
         "level": level,
         "trajectories": len(scores),
         "runs": independent,
-        "holds_for": holds_for,
+        # Too few runs: the bound is then about these runs, and the text says so.
+        "holds_for": holds_for(independent, level),
         **shares.pop("test"),
         "by_scenario": shares,
         "one_step": one_step,

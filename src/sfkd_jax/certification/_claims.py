@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -31,6 +31,10 @@ OUTPUTS = ("position", "yaw")
 """Outputs with a metric of their own: e_y [m] and e_ψ [rad]."""
 FLOAT32 = 1e-5
 """Relative excess over a bound that float32 rounding of an attacked model explains."""
+UNIT_ERROR = 1e-9
+"""Relative error of the size of P, which is fixed."""
+LOOSE = 0.01
+"""Share by which a constant of a metric may exceed the least one that P proves."""
 CONSTANTS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta")
 Box: TypeAlias = Sequence[Any]
 """Lower and upper corner of a box of environments."""
@@ -216,6 +220,9 @@ def _read(witness: Mapping[str, Any]) -> tuple[Matrix, list[list[Vector]]]:
     return np.asarray(witness["metric"], dtype=np.float64), joint
 
 
+ROTATES = "P = I is the only metric that the transport keeps: c_1 = c_2 = 1"
+
+
 def keeps_metrics(weights: Exported) -> bool:
     """Return whether distances in a metric other than I survive a switch of e.
 
@@ -237,11 +244,36 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     fits = claim.metric.shape == weights.operators.vertices.shape[1:]
     require(fits, f"{where}.witness is of another size than the weights")
     rows = readouts(weights)[name]
+
+    def reads(bound: float) -> bool:
+        return reads_within(rows, bound, claim.metric)
+
+    def contracts_at(alpha: float) -> bool:
+        return contracts(claim._replace(alpha=alpha), weights)
+
     checks = {
-        "alpha": claim.alpha < 1.0 and contracts(claim, weights),
-        "lipschitz": reads_within(rows, claim.lipschitz, claim.metric),
+        "alpha": claim.alpha < 1.0 and _is_least(contracts_at, claim.alpha),
+        "lipschitz": _is_least(reads, claim.lipschitz),
+        # Everything measured in |·|_P would change with the scale of P.
+        "the unit of P": abs(size_of(claim.metric) - 1.0) <= UNIT_ERROR,
     }
     require_all(checks, f"{where}.")
+
+
+def _is_least(proved: Callable[[float], bool], bound: float) -> bool:
+    """Whether a bound is proved, and nothing smaller by more than `LOOSE` is.
+
+    The measured radii rest on the constants: looser ones would contradict them.
+    """
+    return proved(bound) and not proved((1.0 - LOOSE) * bound)
+
+
+def size_of(metric: Matrix) -> float:
+    """Return the size of P that is 1 by convention; the scale of P is free.
+
+    Entries of about 1 keep the rounding errors of the core small.
+    """
+    return float(np.trace(metric) / len(metric) + np.max(np.abs(metric))) / 2.0
 
 
 def contracts(claim: OutputMetric | LyapunovClaim, weights: Exported) -> bool:
@@ -309,8 +341,10 @@ def require_lyapunov(part: Mapping[str, Any], weights: Exported) -> None:
     fits = keeps_metrics(weights) and claim.metric.shape == vertices[0].shape
     require(constants and fits, "lyapunov is not a claim about these operators")
     checks = {
-        "rho or condition": check_metric(claim.metric, vertices, rho, condition),
-        "alpha": contracts(claim, weights),
+        "rho or condition": rho < 1.0
+        and check_metric(claim.metric, vertices, rho, condition),
+        "alpha": alpha < 1.0 and contracts(claim, weights),
+        "the unit of P": abs(np.linalg.eigvalsh(claim.metric)[0] - 1.0) <= UNIT_ERROR,
         # Compared as a whole, so that no further key can state an unproved constant.
         "c_1 or c_2": dict(part) == claim.document() | {"witness": part["witness"]},
     }

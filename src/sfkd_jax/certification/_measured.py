@@ -106,6 +106,13 @@ def supports(count: int, level: float) -> bool:
     return math.ceil((count + 1) * level) <= count
 
 
+def holds_for(runs: int, level: float) -> str:
+    """Return what a bound from trajectories of so many independent runs is about."""
+    if supports(runs, level):
+        return "new runs like these"
+    return f"further segments of the same {runs} runs"
+
+
 def conformal_bounds(
     reference: Float[np.ndarray, "other kind"],
     calibration: Float[np.ndarray, "trajectory kind"],

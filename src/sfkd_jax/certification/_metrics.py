@@ -20,11 +20,13 @@ from scipy.optimize import minimize
 
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
+    ROTATES,
     LyapunovClaim,
     OutputMetric,
     contracts,
     keeps_metrics,
     reads_within,
+    size_of,
 )
 from sfkd_jax.certification._core import Matrix, Vector, check_metric
 from sfkd_jax.certification._search import INFEASIBLE, SLACKS, joint_bound, reduced
@@ -56,10 +58,7 @@ RUNS = 8
 def prove_lyapunov(weights: Exported) -> LyapunovClaim:
     """Solve the program at the smallest of the `SHARES` that has an accepted answer."""
     # A rotation on a switch of e keeps no ellipsoid, only the ball.
-    require(
-        keeps_metrics(weights),
-        "P = I is the only metric that the transport keeps: c_1 = c_2 = 1",
-    )
+    require(keeps_metrics(weights), ROTATES)
     vertices = list(weights.operators.vertices)
     norm = max(np.linalg.norm(vertex, 2) for vertex in vertices)
     # No P gives a rate below a spectral radius, by which the search is bounded.
@@ -195,8 +194,7 @@ def propose_metric(
     factor = np.zeros((rank, rank))
     factor[lower] = flat[:entries]
     found = factor @ factor.T
-    # The scale is free: entries of about 1 keep the core's rounding errors small.
-    scale = 2.0 / (np.trace(found) / rank + np.max(np.abs(found)))
+    scale = 1.0 / size_of(found)
     found *= scale
     widths = np.cumsum([len(part) for part in multipliers], dtype=int)[:-1]
     # P and multipliers scale together, or the matrix inequality would be another.

@@ -1,29 +1,33 @@
 """Verification of certificates from an untrusted source, without any search.
 
-Proved constants are derived again from their witnesses, tubes and sums from the proved
-and the measured constants, coverages from their counts. Measured bounds themselves
-cannot be derived; they are checked to be consistent numbers.
+`schema` gives every entry of a document one of three rules: proved entries are checked
+by the trusted core, those that follow are derived again from the policy and from other
+entries, and measured ones lie in a range that the policy and their siblings leave. Only
+a signature could bind a measured number within its range.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from sfkd_jax.certification._certificate import PRECISION, Certificate
+from sfkd_jax.certification._certificate import PRECISION, Certificate, verify
 from sfkd_jax.certification._claims import (
-    FLOAT32,
+    CONSTANTS,
     OUTPUTS,
+    ROTATES,
     OutputMetric,
-    attack_limits,
-    require_box,
-    require_claims,
+    decoders,
+    hull_scope,
+    keeps_metrics,
+    readouts,
     require_lyapunov,
     require_output_metric,
 )
-from sfkd_jax.certification._measured import KINDS, counted, supports
+from sfkd_jax.certification._measured import KINDS, coverage_interval, holds_for
 from sfkd_jax.certification._tubes import ALONE, FORMS, JOINT, tubes
 from sfkd_jax.certification._weights import (
     CertificateStale,
@@ -34,72 +38,70 @@ from sfkd_jax.certification._weights import (
     require,
     well_formed,
 )
-from sfkd_jax.types import Model, Params
+from sfkd_jax.certification.corridor import EXCITATION, LENGTH, ROAD_SETTINGS
+from sfkd_jax.data import SCENARIOS, sizes_of_parts
 
 REPEATED = 1e-9
 """Relative tolerance of recomputed values, for another order of summation."""
+ROUNDED = 1e-6
+"""Relative tolerance of what is stored in float32 in one place and not in the other."""
+SMALLEST, LARGEST = 1e-12, 1e6
+"""Of measured lengths, angles and seconds, far beyond any vehicle."""
+REACH = 100.0
+"""Ends of the data in half widths of the middle 99.8 %."""
+LABELS = (*SCENARIOS, "s1", "s2")
+"""Parts of the test runs by name; the last two are halves, in order of generation."""
 
 
-def verify(
-    certificate: Certificate,
-    params: Params,
-    *,
-    model: Model,
-    weights: Exported | None = None,
-) -> None:
-    """Check a certificate against weights without any search.
+Trained: TypeAlias = Any
+"""A `policy.TrainedModel`: what a certificate is about."""
 
-    Takes milliseconds once `model.structure.explicit` is compiled.
 
-    Args:
-        certificate: from an untrusted source.
-        params: the weights.
-        model: that they belong to.
-        weights: explicit weights of `params`, if already computed.
+class Proved:
+    """An entry that the trusted core checks with its witness."""
 
-    Raises:
-        CertificateStale: it is about other weights.
-        CertificationRefused: a claim does not follow from its witness.
+
+class Follows(NamedTuple):
+    """An entry that is derived again.
+
+    Attributes:
+        value: derived; a dictionary has exactly these keys.
+        share: relative tolerance of numbers.
     """
-    # First the hash: a proof about other weights need not be read at all.
-    if fingerprint(params) != certificate.params_sha256:
-        raise CertificateStale("the certificate is about other weights")
-    weights = exported(model, params) if weights is None else weights
-    with well_formed(), one_thread():
-        require_claims(certificate, weights, certificate.env_box)
-        alpha, limits = certificate.alpha, attack_limits(certificate, weights)
-        require(
-            alpha < 1.0 and certificate.transport_lipschitz == 1.0,
-            f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
-        )
-        # A text that promises more than these checks cover must not pass.
-        covered = certificate.precision == PRECISION
-        require(covered, "precision is not what is covered")
-        for name, value in certificate.attacks.items():
-            limit = limits.get(name)
-            # An attack above the proved bound would contradict the document itself.
-            require(
-                limit is not None and 0 <= value <= limit * (1 + FLOAT32),
-                f"the attack {name} = {value!r} contradicts the bound {limit}",
-            )
-        step = certificate.attacks.get("step")
-        tightness = alpha / step if step else None
-        require(
-            certificate.attack == step and certificate.tightness == tightness,
-            "attack or tightness does not follow from the attacks",
-        )
+
+    value: Any
+    share: float = REPEATED
 
 
-def verify_document(
-    document: Mapping[str, Any], params: Params, *, model: Model, policy_sha256: str
-) -> None:
+class Measured(NamedTuple):
+    """An entry that nothing binds within its range; the document is not signed.
+
+    Attributes:
+        low: smallest value, or one a component.
+        high: largest value, or one a component.
+        kind: int, float or str.
+        whole: n if the value is a share of n, else 0.
+    """
+
+    low: Any = 0.0
+    high: Any = LARGEST
+    kind: type = float
+    whole: int = 0
+
+
+Rule: TypeAlias = Proved | Follows | Measured | dict[str, Any] | list[Any]
+"""Of an entry, or of all entries of an object or a list."""
+SECONDS, TEXT, POSITIVE = Measured(), Measured(kind=str), Measured(SMALLEST)
+COUNT = Measured(1, 10**9, int)
+METRIC = {"metric": Proved(), "joint": Proved()}
+
+
+def verify_document(document: Mapping[str, Any], trained: Trained) -> None:
     """Check a document from an untrusted source against a policy, without any search.
 
     Args:
-        document: from `issue`, with `policy_sha256`.
-        params: the weights.
-        model: the model that they belong to.
-        policy_sha256: hash of the weights and of all settings of model and controller.
+        document: from `certify`.
+        trained: the policy; its settings are those that the hash is about.
 
     Raises:
         CertificateStale: it is about other weights or settings.
@@ -108,150 +110,356 @@ def verify_document(
     # `is not True`: a text "false" or a number must not pass for a valid certificate.
     require(document.get("valid") is True, str(document.get("reason")))
     # Also the settings: the same weights under another controller are another policy.
-    if document.get("policy_sha256") != policy_sha256:
+    if document.get("policy_sha256") != trained.sha256:
         raise CertificateStale("the certificate is about other weights or settings")
-    proof, weights = Certificate.from_document(document), exported(model, params)
-    verify(proof, params, model=model, weights=weights)
-    # After the proof: everything below is arithmetic on constants that hold.
-    with well_formed():
-        for name in ("state", "control", "env"):
-            require_box(f"boxes.{name}", document["boxes"][name])
-        _require_equal("boxes.env", document["boxes"]["env"], proof.env_box)
-        _require_statistics(document["d_bar"])
-        _require_tubes(document["tube"], proof, document["d_bar"])
-        with one_thread():
-            require_lyapunov(document["lyapunov"], weights)
-            _require_outputs(document.get("outputs", {}), weights)
-        require(
-            document["decoder_lipschitz"] == proof.lipschitz.get("decoder"),
-            "decoder_lipschitz is not that of lipschitz",
-        )
-        if (corridor := document.get("corridor")) is not None:
-            outputs = document.get("outputs")
-            require(outputs, "a corridor needs a metric of every output")
-            require_corridor(corridor)
+    weights = exported(trained.model, trained.params)
+    with well_formed(), np.errstate(all="ignore"):
+        require_entry("", document, schema(document, trained, weights))
+    # Types are what they should be from here on.
+    proof = Certificate.from_document(document)
+    verify(proof, trained.params, model=trained.model, weights=weights)
+    with well_formed(), one_thread():
+        require_lyapunov(document["lyapunov"], weights)
+        for name, part in document["outputs"].items():
+            require_output_metric(name, OutputMetric.from_document(part), weights)
 
 
-def _require_statistics(d_bar: Mapping[str, Any]) -> None:
-    """Check measured bounds, level, counts, coverages and their intervals."""
-    one_step = _numbers("d_bar.one_step", [d_bar["one_step"][kind] for kind in KINDS])
-    require(np.all(one_step >= 0), "d_bar.one_step must be numbers, none below 0")
-    # `value` repeats the latent bound; with two, it would be open which a tube uses.
-    _require_equal("d_bar.value", d_bar["value"], d_bar["one_step"]["latent"])
-    trajectories, runs, level = d_bar["trajectories"], d_bar["runs"], d_bar["level"]
-    require(
-        0 < level < 1 and supports(trajectories, level),
-        f"d_bar.level = {level!r} is not possible with {trajectories!r} trajectories",
+def schema(
+    document: Mapping[str, Any], trained: Trained, weights: Exported
+) -> dict[str, Any]:
+    """Return the rule of every entry that a document about this policy must have.
+
+    A new entry is one line here; entries without a rule are refused.
+    """
+    lipschitz, step = document["lipschitz"], document["attacks"].get("step")
+    low, high = map(trained.settings["environment"].get, ("low", "high"))
+    outputs = [*readouts(weights), *decoders(weights)]
+    networks = {"residual": weights.residual, **decoders(weights)}
+    found = [f"{name}_slopes" for name, layers in networks.items() if layers]
+    # All attacks, or those that need no running model.
+    found += ["step_slopes", *(["step", "transport", *outputs] if step else [])]
+    versions = ("python", "numpy", "jax", "sfkd_jax", "scipy")
+    rules: dict[str, Any] = {
+        "valid": Follows(True),
+        "policy_sha256": Follows(trained.sha256),
+        "weights_sha256": Follows(trained.weights_sha256),
+        "params_sha256": Follows(fingerprint(trained.params)),
+        "precision": Follows(PRECISION),
+        "scope": Follows(hull_scope(weights)),
+        **dict.fromkeys(CONSTANTS, Proved()),
+        "transport_lipschitz": Follows(1.0),
+        "lipschitz": dict.fromkeys(outputs, Proved()),
+        "decoder_lipschitz": Follows(lipschitz.get("decoder")),
+        "witnesses": dict.fromkeys(("residual", "joint", *decoders(weights)), Proved()),
+        "attacks": dict.fromkeys(found, Measured()),
+        "attack": Follows(step),
+        "tightness": Follows(document["alpha"] / step if step else None),
+        "lyapunov": _lyapunov(document["lyapunov"], weights),
+        # Of the settings; for logs without a box, that of the data.
+        "env_box": Follows([[*low], [*high]], ROUNDED)
+        if low is not None and high is not None
+        else _box(trained, "env", 1.0),
+        "boxes": _boxes(document, trained),
+        "d_bar": _one_step(document["d_bar"], trained),
+        "tube": _prediction(document),
+        "outputs": {},
+        "versions": dict.fromkeys(versions, TEXT),
+        "seconds": SECONDS,
+        "seconds_proof": SECONDS,
+    }
+    # With a metric of each output or without any: a corridor needs both.
+    if document["outputs"] != {}:
+        rules["outputs"] = {name: _output(document, name) for name in OUTPUTS}
+        # Simulated runs have a corridor; logs have no plant to drive.
+        if _is_simulated(trained):
+            rules["corridor"] = _corridor(document, trained)
+    # What `certify` was asked for, if it was asked by a command.
+    if "certification" in document:
+        rules["certification"] = _asked_for(document)
+    return rules
+
+
+def _is_simulated(trained: Trained) -> bool:
+    """Whether the data of the policy were simulated by this package."""
+    return "segments" in trained.settings.get("dataset", {})
+
+
+def _lyapunov(stated: Mapping[str, Any], weights: Exported) -> Rule:
+    """The paper's constants, or the reason why there are none."""
+    if not keeps_metrics(weights):
+        return {"reason": Follows(ROTATES)}
+    if "reason" in stated:
+        return {"reason": TEXT}
+    root = math.sqrt(stated["condition"])
+    constants = dict.fromkeys(("rho", "condition", "alpha"), Proved())
+    derived = dict.fromkeys(("c_1", "c_2"), Follows(root))
+    return constants | derived | {"witness": METRIC}
+
+
+def _box(trained: Trained, part: str, reach: float = REACH) -> list[Any]:
+    """Corners of data with the scales of the model: at the half width or beyond it."""
+    space = trained.settings["space"]
+    centre, half = (np.asarray(space[f"{part}_{of}"]) for of in ("mean", "scale"))
+    rounding = ROUNDED * (np.abs(centre) + half)
+    # A channel that never moved has the scale 1, and may have no width.
+    inner = np.where(half == 1.0, 0.0, half) - rounding
+    outer = reach * half + rounding
+    lower, upper = (centre - outer, centre - inner), (centre + inner, centre + outer)
+    data = trained.settings.get("dataset", {})
+    if part == "control" and trained.law is not None and _is_simulated(trained):
+        # ν, κ and v_ref are drawn within limits.
+        largest = np.asarray([*trained.law.perturbation, data["peak_curvature"]])
+        slowest, fastest = data["speed"]
+        lower = np.append(-largest, slowest) - rounding, lower[1]
+        upper = upper[0], np.append(largest, fastest) + rounding
+    return [Measured(*lower), Measured(*upper)]
+
+
+def _boxes(document: Mapping[str, Any], trained: Trained) -> Rule:
+    """Boxes of the data; those of logs have names."""
+    rules: dict[str, Any] = {
+        "state": _box(trained, "body"),
+        "control": _box(trained, "control"),
+        "env": Follows(document["env_box"], 0.0),
+    }
+    if columns := trained.settings.get("dataset", {}).get("columns"):
+        # Columns of an environment that the policy ignores are not named.
+        known = columns["environment"] if document["boxes"]["names"]["env"] else []
+        named = [*columns["state"][3:]], [*columns["control"]], [*known]
+        rules["names"] = Follows(dict(zip(rules, named, strict=True)))
+    return rules
+
+
+def _covered(stated: Mapping[str, Any], count: Rule, runs: Rule) -> dict[str, Any]:
+    """A coverage with its counts, and the interval that follows from them."""
+    share, sizes = stated["coverage"], stated["coverage_trajectories"]
+    return {
+        "coverage": Measured(0.0, 1.0, whole=sizes),
+        "coverage_ci95": Follows(coverage_interval(share, stated["coverage_runs"])),
+        "coverage_trajectories": count,
+        "coverage_runs": runs,
+    }
+
+
+def _one_step(d_bar: Mapping[str, Any], trained: Trained) -> Rule:
+    """Bounds on the error of one step, and on which runs they held."""
+    count, test = d_bar["trajectories"], d_bar["coverage_trajectories"]
+    runs, level = d_bar["runs"], d_bar["level"]
+    rules = {
+        "value": Follows(d_bar["one_step"]["latent"]),
+        "level": Measured(SMALLEST, count / (count + 1)),
+        "trajectories": COUNT,
+        "runs": Measured(1, count, int),
+        "holds_for": Follows(holds_for(runs, level)),
+        **_covered(d_bar, COUNT, Measured(1, test, int)),
+        "by_scenario": {},
+        "one_step": dict.fromkeys(KINDS, Measured()),
+        "validation": Measured(),
+    }
+    if not _is_simulated(trained):
+        return rules
+    # Every simulated segment is a run of its own, and all test runs have a label.
+    data, stated = trained.settings["dataset"], d_bar["by_scenario"]
+    *_, calibration, tested = sizes_of_parts(data["segments"], data["shares"])
+    whole, labels = Follows(tested), [name for name in LABELS if name in stated]
+    parts = [stated[name] for name in labels]
+    sizes = [part["coverage_trajectories"] for part in parts]
+    inside = sum(
+        part["coverage"] * size for part, size in zip(parts, sizes, strict=True)
     )
-    require(
-        1 <= runs <= trajectories,
-        f"d_bar.runs = {runs!r} does not fit {trajectories!r} trajectories",
-    )
-    for name, part in {"d_bar": d_bar, **d_bar["by_scenario"]}.items():
-        _require_coverage(name, part)
+    rules |= _covered(d_bar, whole, whole)
+    rules |= dict.fromkeys(("trajectories", "runs"), Follows(calibration))
+    rules["coverage"] = Follows(inside / tested)
+    rules["by_scenario"] = {"s3": _covered(stated["s3"], whole, whole)}
+    for name, part, size in zip(labels, parts, sizes, strict=True):
+        rest = Follows(int(tested - (sum(sizes) - size)))
+        rules["by_scenario"][name] = _covered(part, rest, rest)
+    return rules
 
 
-def _require_tubes(
-    tube: Mapping[str, Any], proof: Certificate, d_bar: Mapping[str, Any]
-) -> None:
-    """Check R_k, its limit, and the radii in metres and radians."""
-    largest = None
-    # With a decoder of increments the step length counts; it is measured.
-    if "decoder" in proof.lipschitz:
-        stated = tube["largest_increment_m"]
-        largest = float(_numbers("tube.largest_increment_m", stated))
-        require(largest >= 0, "tube.largest_increment_m is below 0")
+def _prediction(document: Mapping[str, Any]) -> Rule:
+    """R_k, its limit, and the radii in metres and radians."""
+    tube, lipschitz = document["tube"], document["lipschitz"]
+    # With a decoder of increments the length of a step counts; it is measured.
+    adds_up = "decoder" in lipschitz
     derived = tubes(
-        alpha=proof.alpha,
-        lipschitz=proof.lipschitz,
-        one_step=d_bar["one_step"],
+        alpha=document["alpha"],
+        lipschitz=lipschitz,
+        one_step=document["d_bar"]["one_step"],
         horizon=len(tube["latent"]),
-        largest_increment=largest,
+        largest_increment=tube["largest_increment_m"] if adds_up else None,
     )
-    _require_equal("tube", tube, derived)
+    rules: dict[str, Any] = {name: Follows(value) for name, value in derived.items()}
+    return rules | ({"largest_increment_m": Measured()} if adds_up else {})
 
 
-def _require_outputs(outputs: Mapping[str, Any], weights: Exported) -> None:
-    """Check output metrics from their witnesses, and the coverage of their tubes."""
-    # All or none: a corridor needs both metrics.
-    require(
-        not outputs or set(outputs) == set(OUTPUTS),
-        f"outputs must be {' and '.join(OUTPUTS)}, got {', '.join(map(str, outputs))}",
-    )
-    for name, part in outputs.items():
-        require_output_metric(name, OutputMetric.from_document(part), weights)
-        runs = part["coverage_runs"]
-        for form in FORMS:
-            radius = _numbers(f"outputs.{name}.tube", part["tube"][form])
-            require(radius > 0, f"outputs.{name}.tube.{form} is no radius")
-            stated = {key: part[key][form] for key in ("coverage", "coverage_ci95")}
-            counts = {"coverage_trajectories": runs, "coverage_runs": runs}
-            _require_coverage(f"outputs.{name}", stated | counts)
+def _output(document: Mapping[str, Any], name: str) -> Rule:
+    """The metric of an output, and its tubes with their coverage."""
+    part, runs = document["outputs"][name], document["d_bar"]["coverage_trajectories"]
+    intervals = {
+        form: coverage_interval(part["coverage"][form], runs) for form in FORMS
+    }
+    # From the largest disturbance alone: on every run the larger of the two bounds.
+    loosest = part["tube"]["asymptotic"] * (1 + REPEATED)
+    tube = {"asymptotic": POSITIVE, "vehicle_to_nominal": Measured(SMALLEST, loosest)}
+    return {
+        **dict.fromkeys(("alpha", "lipschitz"), Proved()),
+        "witness": METRIC,
+        "tube": tube,
+        "coverage": dict.fromkeys(FORMS, Measured(0.0, 1.0, whole=runs)),
+        "coverage_ci95": Follows(intervals),
+        "coverage_runs": Follows(runs),
+    }
 
 
-def require_corridor(corridor: Mapping[str, Any]) -> None:
-    """Check sums, level and counts of the document's corridor."""
-    bounds = corridor["bounds"]
-    complete = set(bounds) == {*JOINT, *ALONE}
-    require(
-        complete and np.all(_numbers("corridor.bounds", [*bounds.values()]) > 0),
-        "corridor.bounds must be positive numbers, one for each measured quantity",
-    )
+def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
+    """The corridor: its bounds, on which runs they held, and how it was attacked."""
+    corridor, d_bar = document["corridor"], document["d_bar"]
+    bounds, attack, level = corridor["bounds"], corridor["attack"], corridor["level"]
+    runs, s3 = Follows(corridor["runs"]), corridor["by_scenario"]["s3"]
+    tube = bounds["vehicle_to_nominal_position"]
     # Car to nominal model plus nominal model to path: the triangle inequality.
-    width = bounds["nominal"] + bounds["vehicle_to_nominal_position"]
-    _require_equal("corridor.corridor_m", corridor["corridor_m"], width)
-    runs, level = corridor["runs"], corridor["level"]
-    require(
-        isinstance(runs, int) and 0 < level < 1 and supports(runs, level),
-        f"corridor.level = {level!r} is not possible with {runs!r} runs",
+    width = bounds["nominal"] + tube
+    # Where all bounds held on all runs, nothing farther was seen.
+    covered = corridor["coverage"] == 1.0
+    return {
+        "conditions": _conditions(document, trained),
+        "level": Follows(d_bar["level"]),
+        "runs": Measured(math.ceil(level / (1 - level) - ROUNDED), 10**6, int),
+        "bounds": dict.fromkeys((*JOINT, *ALONE), POSITIVE),
+        "corridor_m": Follows(width),
+        **_covered(corridor, runs, runs),
+        "by_scenario": {"s3": _covered(s3, runs, runs)},
+        "seen": {
+            "distance_m": Measured(0.0, tube if covered else LARGEST),
+            "lateral_m": Measured(0.0, width if covered else LARGEST),
+        },
+        "attack": {
+            "steps": COUNT,
+            "lateral_m": Measured(),
+            "distance_m": Measured(),
+            "shielded_lateral_m": Measured(),
+            "kept_lateral_m": Measured(0.0, attack["shielded_lateral_m"]),
+            # With disturbances within their bound: leaving would refute the proof.
+            "kept_distance_m": Measured(0.0, tube),
+            "over_corridor": Follows(attack["kept_lateral_m"] / width),
+            "over_tube": Follows(attack["kept_distance_m"] / tube),
+        },
+        # No farther than the runs of the attack reach.
+        "shield_horizon": Measured(1, LENGTH, int),
+        "seconds": SECONDS,
+    }
+
+
+def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
+    """Where the corridor holds: conditions of the data, switching and sensors."""
+    corridor, settings = document["corridor"], trained.settings
+    bounds, stated = corridor["bounds"], corridor["conditions"]
+    # On every run the nominal model started at a measurement: its error is in the tube.
+    alphas = [document["outputs"][name]["alpha"] for name in OUTPUTS]
+    position, yaw = (
+        bounds[f"vehicle_to_nominal_{name}"] / alpha
+        for name, alpha in zip(OUTPUTS, alphas, strict=True)
     )
-    # The attack kept disturbances in their bound: leaving would refute the proof.
-    require(
-        corridor["attack"]["over_tube"] <= 1.0,
-        "corridor.attack left the tube with disturbances within their bound",
+    sensors = len(stated["sensor_noise"])
+    largest = [position, position, yaw, *[REACH] * sensors][:sensors]
+    given = {name: settings["dataset"][name] for name in (*ROAD_SETTINGS, *EXCITATION)}
+    dwell, dt = stated["dwell_s"], settings["vehicle"]["dt"]
+    return {
+        **{name: Follows(value) for name, value in given.items()},
+        "env_box": Follows(document["env_box"], ROUNDED),
+        "perturbation": Follows(np.asarray(trained.law.perturbation), ROUNDED),
+        "dwell_s": [Measured(dt, dwell[1]), Measured(dt)],
+        "duration_s": Measured(2.0),
+        "sensor_noise": [Measured(0.0, high) for high in largest],
+    }
+
+
+def _asked_for(document: Mapping[str, Any]) -> Rule:
+    """Settings of the command; what they made stands elsewhere in the document."""
+    corridor: dict[str, Any] = dict.fromkeys(("runs", "horizon", "attack_steps"), COUNT)
+    corridor |= {"duration": POSITIVE, "dwell": [POSITIVE, POSITIVE]}
+    if made := document.get("corridor"):
+        corridor = {
+            "runs": Follows(made["runs"]),
+            "horizon": Follows(made["shield_horizon"]),
+            "attack_steps": Follows(made["attack"]["steps"]),
+            "duration": Follows(made["conditions"]["duration_s"]),
+            "dwell": Follows(made["conditions"]["dwell_s"]),
+        }
+    return {
+        "level": Follows(document["d_bar"]["level"]),
+        "horizon": Follows(len(document["tube"]["latent"])),
+        "attack_starts": Measured(0, 10**6, int),
+        "corridor": corridor,
+    }
+
+
+def require_entry(where: str, stated: Any, rule: Rule) -> None:
+    """Refuse the first entry that its rule does not allow, by name."""
+    if isinstance(rule, dict):
+        require(isinstance(stated, dict), f"{where or 'it'} is not an object")
+        # Also keys without a rule: what nothing checks would be read by somebody.
+        for key in dict.fromkeys([*rule, *stated]):
+            name = f"{where}.{key}".removeprefix(".")
+            require(key in stated, f"{name} is missing")
+            require(key in rule, f"{name!a} is not an entry of a certificate")
+            require_entry(name, stated[key], rule[key])
+    elif isinstance(rule, list):
+        fits = isinstance(stated, list) and len(stated) == len(rule)
+        require(fits, f"{where} is not a list of {len(rule)}")
+        for index, (entry, each) in enumerate(zip(stated, rule, strict=True)):
+            require_entry(f"{where}.{index}", entry, each)
+    elif isinstance(rule, Follows):
+        follows = _equal(stated, rule.value, rule.share)
+        require(follows, f"{where} does not follow from the policy and other entries")
+    elif isinstance(rule, Measured):
+        low, high = np.asarray(rule.low).tolist(), np.asarray(rule.high).tolist()
+        within = f"{rule.kind.__name__} from {low} to {high}"
+        require(_in_range(stated, rule), f"{where} = {stated!a:.60} is no {within}")
+    else:
+        require(_is_finite(stated), f"{where} is not made of finite numbers")
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether a value is a finite number, or lists of nothing else."""
+    if isinstance(value, list):
+        return all(map(_is_finite, value))
+    # True is an int in Python, and "1" a number to numpy.
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and math.isfinite(value)
+
+
+def _in_range(stated: Any, rule: Measured) -> bool:
+    """Whether a measured entry is of its kind and between its limits."""
+    if rule.kind is str:
+        return isinstance(stated, str) and stated.isprintable() and len(stated) < 200
+    whole = rule.kind is not int or type(stated) is int
+    if not whole or not _is_finite(stated) or np.shape(stated) != np.shape(rule.low):
+        return False
+    of = rule.whole * stated if rule.whole else 0.0
+    inside = np.all(
+        (rule.low <= np.asarray(stated)) & (stated <= np.asarray(rule.high))
     )
-    for name, part in {"corridor": corridor, **corridor["by_scenario"]}.items():
-        _require_coverage(name, part)
+    return bool(inside) and abs(of - round(of)) <= REPEATED * max(of, 1.0)
 
 
-def _require_coverage(name: str, part: Mapping[str, Any]) -> None:
-    """Check that a coverage is a count of trajectories, and its interval."""
-    count, runs = part["coverage_trajectories"], part["coverage_runs"]
-    share = part["coverage"]
-    inside = round(share * count)
-    require(
-        0 <= inside <= count and 1 <= runs <= count,
-        f"{name}: a coverage of {share!r} is not possible with {count!r} trajectories "
-        f"of {runs!r} runs",
-    )
-    # A share must be a count over the number of trajectories, within rounding.
-    for key, value in counted(inside / count, count, runs).items():
-        _require_equal(f"{name}: {key}", part[key], value)
-
-
-def _numbers(name: str, values: Any) -> np.ndarray:
-    """Return a part of a document as an array of finite numbers."""
-    array = np.asarray(values)
-    # Booleans and strings are refused by the kind, before they compare as numbers.
-    finite = array.dtype.kind in "if" and np.all(np.isfinite(array))
-    require(finite, f"{name} must be finite numbers")
-    return array
-
-
-def _require_equal(name: str, stated: Any, derived: Any) -> None:
-    """Check a stated value, or all by the same keys, against the derived ones."""
+def _equal(stated: Any, derived: Any, share: float) -> bool:
+    """Whether an entry is what is derived: numbers nearly, all else exactly."""
     if isinstance(derived, dict):
         # All keys: a value that is left out here would be checked nowhere.
-        equal = set(stated) == set(derived)
-        for key in derived if equal else ():
-            _require_equal(f"{name}.{key}", stated[key], derived[key])
-    elif derived is None:
-        equal = stated is None
-    else:
-        # Both finite: any number is within a share of an infinite one.
-        expected, actual = _numbers(name, derived), _numbers(name, stated)
-        # Relative to the derived value, which an attacker cannot choose.
-        equal = actual.shape == expected.shape and np.all(
-            np.abs(actual - expected) <= REPEATED * np.abs(expected)
+        return (
+            isinstance(stated, dict)
+            and set(stated) == set(derived)
+            and all(_equal(stated[key], derived[key], share) for key in derived)
         )
-    require(equal, f"{name} does not follow from the rest of the document")
+    expected = np.asarray(derived)
+    if isinstance(derived, int) or expected.dtype.kind not in "if":
+        return type(stated) is type(derived) and stated == derived
+    # Both finite: any number is within a share of an infinite one.
+    if not (_is_finite(stated) and _is_finite(expected.tolist())):
+        return False
+    actual = np.asarray(stated)
+    # Relative to the derived value, which an attacker cannot choose.
+    near = np.abs(actual - expected) <= share * np.abs(expected)
+    return actual.shape == expected.shape and bool(np.all(near))

@@ -59,6 +59,8 @@ def well_formed() -> Iterator[None]:
     """Refuse a document whose values are of unexpected types, in one line."""
     try:
         yield
+    except KeyError as reason:
+        raise CertificationRefused(f"the certificate lacks {reason}") from None
     except MALFORMED as reason:
         raise CertificationRefused(
             f"the certificate is malformed: {' '.join(str(reason).split())}"

@@ -95,8 +95,8 @@ def split(
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
-    edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
-    if min(np.diff([0, *edges, count])) < 1:
+    sizes = sizes_of_parts(count, shares)
+    if min(sizes) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
     for name in ("states", "controls"):
         if not bool(jnp.all(jnp.isfinite(getattr(trajectories, name)))):
@@ -113,7 +113,7 @@ def split(
     # Not "any outside": a NaN is neither inside nor outside.
     if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
-    rows = jnp.split(jax.random.permutation(key, count), edges)
+    rows = jnp.split(jax.random.permutation(key, count), np.cumsum(sizes)[:-1])
     parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in rows]
     # Labels in the same order, so that a part knows its scenarios.
     labels = None
@@ -278,6 +278,12 @@ def assign_parts(
             f"dataset.shares={list(shares)}; record more"
         )
     return parts, False
+
+
+def sizes_of_parts(count: int, shares: Sequence[float]) -> list[int]:
+    """Return the sizes of the four parts of `count` trajectories."""
+    edges = np.round(np.cumsum(shares)[:-1] * count).astype(int)
+    return np.diff([0, *edges, count]).tolist()
 
 
 def measure_space(dataset: Dataset) -> Space:

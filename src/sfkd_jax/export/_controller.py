@@ -91,9 +91,8 @@ def write_controller(
     for stale in (MANIFEST, policy.CERTIFICATE, *(f"{f}.vmfb" for f in FILES.values())):
         (folder / stale).unlink(missing_ok=True)
     # The policy too, so that `load` reads an export as it reads a run.
-    stored = policy.save(
-        folder / "policy.safetensors", trained.weights, trained.settings
-    )
+    path = folder / "policy.safetensors"
+    stored = policy.save(path, trained.weights, trained.settings, law=trained.law)
     manifest = {
         "kind": "controller",
         "format": FORMAT,
