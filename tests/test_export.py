@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, dataset, jit, space, straight
+from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 
 import sfkd_jax
 from sfkd_jax import build, certification, policy, store

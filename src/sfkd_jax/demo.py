@@ -82,7 +82,8 @@ def _load(settings: Settings, directory: Path) -> policy.Policy:
     if corridor := trained.certificate.get("corridor"):
         store.print_message(
             f"corridor: {corridor['corridor_m']:.2f} m to each side, "
-            f"on {100 * corridor['level']:.0f} % of the runs under its conditions"
+            f"on {100 * corridor['level']:.0f} % of the runs under its conditions "
+            "(measured, unsigned)"
         )
     return trained
 

@@ -248,7 +248,8 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
     if corridor := document.get("corridor"):
         verdict += f"; corridor {corridor['corridor_m']:.3f} m to each side, measured"
     if d_bar := document.get("d_bar"):
-        verdict += f"; d_bar {d_bar['value']:.4g} holds for {d_bar['holds_for']}"
+        about = f"holds for {d_bar['holds_for']} (measured, unsigned)"
+        verdict += f"; d_bar {d_bar['value']:.4g} {about}"
     for line in (verdict, document.get("lyapunov", {}).get("reason")):
         if line:
             store.print_message(f"certificate: {line}")

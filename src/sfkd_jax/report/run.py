@@ -26,7 +26,8 @@ MADE_BY = {
 PROOF = (
     "Proved: recomputed from the stored weights, for every state, command and "
     "environment in the boxes. Measured: a quantile over runs that training never saw, "
-    "promised for further runs under the same conditions. Outside the boxes nothing is "
+    "promised for further runs under the same conditions. Unsigned: whoever can write "
+    "the file can change such a number within its range. Outside the boxes nothing is "
     "claimed."
 )
 _WRITERS = {
