@@ -376,22 +376,19 @@ def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
 
 
 def _asked_for(document: Mapping[str, Any]) -> Rule:
-    """Settings of the command; what they made stands elsewhere in the document."""
-    corridor: dict[str, Any] = dict.fromkeys(("runs", "horizon", "attack_steps"), COUNT)
-    corridor |= {"duration": POSITIVE, "dwell": [POSITIVE, POSITIVE]}
+    """Settings of the command, which are settings of the corridor too."""
+    steps = dict.fromkeys(("runs", "horizon", "attack_steps"), COUNT)
+    seconds = {"duration": POSITIVE, "dwell": [POSITIVE, POSITIVE]}
     if made := document.get("corridor"):
-        corridor = {
-            "runs": Follows(made["runs"]),
-            "horizon": Follows(made["shield_horizon"]),
-            "attack_steps": Follows(made["attack"]["steps"]),
-            "duration": Follows(made["conditions"]["duration_s"]),
-            "dwell": Follows(made["conditions"]["dwell_s"]),
-        }
+        conditions, sizes = made["conditions"], (made["runs"], made["shield_horizon"])
+        sizes += (made["attack"]["steps"],)
+        steps = {name: Follows(n) for name, n in zip(steps, sizes, strict=True)}
+        seconds = {name: Follows(conditions[f"{name}_s"]) for name in seconds}
     return {
         "level": Follows(document["d_bar"]["level"]),
         "horizon": Follows(len(document["tube"]["latent"])),
         "attack_starts": Measured(0, 10**6, int),
-        "corridor": corridor,
+        "corridor": steps | seconds,
     }
 
 
