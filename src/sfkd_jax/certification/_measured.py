@@ -21,6 +21,8 @@ ROUNDING = 1e-9
 """Far above the rounding error of a share times a count."""
 CHUNK = 50
 """Runs in a batch."""
+TAIL = 0.1
+"""Part of the runs whose largest values are fitted."""
 
 
 class Residuals(NamedTuple):
@@ -142,6 +144,26 @@ def conformal_bounds(
     units[units <= 0] = 1.0  # a kind that is always 0 needs no unit
     # The largest kind of each trajectory in common units: one score, a joint bound.
     return units * conformal_quantile(np.max(calibration / units, axis=1), level)
+
+
+def alarm_thresholds(
+    reference: Float[np.ndarray, "other chart"],
+    maxima: Float[np.ndarray, "run chart"],
+    *,
+    rate: float,
+) -> Float[np.ndarray, " chart"]:
+    """Return thresholds that a share `rate` of new runs exceeds in any chart.
+
+    The unit of a chart is its 0.99-quantile over `reference`. The largest value of a
+    run in units has a tail that is taken as exponential, fitted to the largest `TAIL`:
+    a rate below one in a run cannot be counted on any affordable number of runs.
+    """
+    units = np.quantile(reference, 0.99, axis=0)
+    units[units <= 0] = 1.0
+    largest = np.max(maxima / units, axis=1)
+    start = np.quantile(largest, 1.0 - TAIL)
+    excess = float(np.mean(largest[largest > start] - start))
+    return units * (start + excess * max(math.log(TAIL / rate), 0.0))
 
 
 def coverage(

@@ -19,6 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sfkd_jax.certification._alarms import (
+    Observed,
+    calibrate_innovations,
+    innovations,
+)
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
 from sfkd_jax.certification._measured import residuals
@@ -29,7 +34,7 @@ from sfkd_jax.certification._tubes import (
     radii,
 )
 from sfkd_jax.control import PathLaw, safety_filter
-from sfkd_jax.data import drive_along_path, from_s3
+from sfkd_jax.data import drive_along_path, from_s3, sensor_keys
 from sfkd_jax.geometry import LATERAL, PERTURBATION, path_state
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.ranges import Interval, Span
@@ -48,8 +53,10 @@ from sfkd_jax.types import (
 
 ROAD_SETTINGS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
 EXCITATION = ("steering_excitation", "speed_excitation")
-STREAM = 4
-"""Stream folded into the data set's seed; the data set uses streams 0 to 2."""
+STREAM, ALARMS = 4, 5
+"""Streams folded into the data set's seed, of the corridor and of the test of
+innovations; the data set uses streams 0 to 2.
+"""
 BLOCK = 5
 """Steps for which the attack holds ν."""
 GENERATIONS = 10
@@ -141,10 +148,9 @@ def certify_corridor(
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     low, high = data["env_low"], data["env_high"]
     excited = {name: data[name] for name in (*ROAD_SETTINGS, *EXCITATION)}
-    # A stream of its own: the data set's runs must not reappear in its certificate.
-    *run_keys, sensor_key, attack_key = jax.random.split(
-        jax.random.fold_in(jax.random.key(data["seed"]), STREAM), 6
-    )
+    # Streams of their own: the data set's runs must not reappear in its certificate.
+    stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
+    *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
     sensors = partial(_sensor_effect, loop)
     options = excited | {"sensors": sensors, "offset": (0.0, 0.0, 0.0), "burn_in": 0}
     steps, dt = round(duration / loop.plant.dt), loop.plant.dt
@@ -180,6 +186,12 @@ def certify_corridor(
     held = max(1, round(dwell[0] / dt))
     bound = bounds["vehicle_to_nominal_position"]
     search = _Search(loop, claims["position"], bound, data, held, attack_steps)
+    observe = jax.jit(partial(_observed, loop))
+    alarms = calibrate_innovations(
+        *(lambda key, kind=kind: observe(kind(key), key) for kind in kinds[2:]),
+        stream(ALARMS),
+        duration=duration,
+    )
     return {
         "conditions": excited | conditions,
         "level": level,
@@ -194,6 +206,7 @@ def certify_corridor(
             "lateral_m": float(np.max(np.abs(lateral))),
         },
         "attack": _attack(search, attack_key, bounds["nominal"], horizon),
+        "innovations": alarms,
         "shield_horizon": horizon,
         "seconds": time.perf_counter() - began,
     }
@@ -255,6 +268,15 @@ def _sensor_effect(
     return loop.law(measured, road[0], road[1], env) - loop.law(
         coordinates, road[0], road[1], env
     )
+
+
+def _observed(loop: Loop, runs: Trajectory, key: Key) -> Observed:
+    """Innovations of `driven` runs with the noise that their law read."""
+    # The keys of the runs, as `driven` makes them of the same one.
+    keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
+    spread = _spread(loop.noise, runs.states.shape[-1])[BODY]
+    noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
+    return innovations(loop.model, loop.params, loop.law, runs, spread * noise)
 
 
 def _spread(noise: tuple[float, ...], size: int) -> Array:

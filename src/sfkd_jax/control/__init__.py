@@ -44,5 +44,11 @@ from sfkd_jax.control.wrappers._gate import Gate as Gate
 from sfkd_jax.control.wrappers._guard import FILTER_SCALES as FILTER_SCALES
 from sfkd_jax.control.wrappers._guard import Shield as Shield
 from sfkd_jax.control.wrappers._guard import safety_filter as safety_filter
+from sfkd_jax.control.wrappers._innovations import InnovationTest as InnovationTest
+from sfkd_jax.control.wrappers._innovations import (
+    expected_coordinates as expected_coordinates,
+)
+from sfkd_jax.control.wrappers._innovations import innovation_test as innovation_test
+from sfkd_jax.control.wrappers._innovations import steering_level as steering_level
 from sfkd_jax.control.wrappers._online_tube import OnlineTube as OnlineTube
 from sfkd_jax.geometry import reference_curvature as reference_curvature

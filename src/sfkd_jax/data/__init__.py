@@ -23,4 +23,5 @@ from sfkd_jax.data._generation import from_s3 as from_s3
 from sfkd_jax.data._generation import generate as generate
 from sfkd_jax.data._generation import generate_along_path as generate_along_path
 from sfkd_jax.data._generation import segment_scenarios as segment_scenarios
+from sfkd_jax.data._generation import sensor_keys as sensor_keys
 from sfkd_jax.data._logs import Columns as Columns

@@ -357,9 +357,7 @@ def drive_along_path(
     def one(given: tuple[Array, Key]) -> Trajectory:
         envs = jnp.concatenate([jnp.repeat(given[0][:1], burn_in, axis=0), given[0]])
         road_key, nu_key, start_key = jax.random.split(given[1], 3)
-        sensor_keys = jax.random.split(
-            jax.random.fold_in(given[1], SENSORS), envs.shape[0]
-        )
+        sensor_keys = _sensor_keys(given[1], envs.shape[0])
         speeds, curvatures = road(road_key, steps=envs.shape[0])
         nus = _perturbations(nu_key, steps=envs.shape[0], spread=limits)
         nus = jnp.clip(
@@ -386,6 +384,19 @@ def drive_along_path(
 
     keys = jax.random.split(key, envs.shape[0])
     return in_batches(one, (envs, keys), size=BATCH)
+
+
+def _sensor_keys(key: Key, steps: int) -> Key:
+    """A key a step for the sensors of one run."""
+    return jax.random.split(jax.random.fold_in(key, SENSORS), steps)
+
+
+def sensor_keys(key: Key, runs: int, steps: int) -> Key:
+    """Return the keys that `drive_along_path` gave to `sensors`, (run, time).
+
+    Without a burn-in, with its key; so that what the law measured can be drawn again.
+    """
+    return jax.vmap(lambda run: _sensor_keys(run, steps))(jax.random.split(key, runs))
 
 
 def _road(

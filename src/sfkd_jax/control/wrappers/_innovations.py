@@ -1,0 +1,125 @@
+"""A statistical test whether a vehicle is the one that its nominal model describes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.geometry import HEADING, PathState, path_state
+from sfkd_jax.types import BODY, Control, Environment, Fiber, Model, Scalar
+
+WINDOWS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
+"""Weights of the newest score in the moving means: windows of 1 to 330 steps."""
+RELEASE = 0.7
+"""Statistic below which an alarm ends: at 1 it would flicker."""
+
+Means = Float[Array, "window coordinate"]
+
+
+class InnovationState(NamedTuple):
+    """What the test carries from one control step to the next.
+
+    Attributes:
+        expected: ξ of this step, predicted from the last measured one.
+        comparable: which of its entries may be compared.
+        level: of the prediction, see `steering_level`.
+        means: moving means of the scores.
+        alarm: whether the last step raised or kept one.
+    """
+
+    expected: PathState
+    comparable: Bool[Array, " coordinate"]
+    level: Scalar
+    means: Means
+    alarm: Bool[Array, ""]
+
+
+class InnovationTest(NamedTuple):
+    """Moving means of weighted one-step innovations, against calibrated thresholds.
+
+        r = ξ⁺ − F(ξ; u − law(ξ), κ, v_ref, e),   s = r σ_0 / σ(level)²
+        m_w ← m_w + w (s − m_w),   statistic = max |m_w| / threshold_w
+
+    r is from one measurement to the next, so that noise telescopes in a mean over w⁻¹
+    steps, and what lasts decides. The weight 1/σ² is that of the likelihood ratio of a
+    constant error in noise of changing size. Short windows detect a jump, long ones a
+    drift (geometric moving averages; Roberts, 1959). Above 1 the vehicle or its sensors
+    are not those of the calibration.
+
+    Attributes:
+        levels: rising, of `steering_level`.
+        deviation: σ of r at these levels, in units of ξ.
+        threshold: of the moving means, for each of `WINDOWS`.
+    """
+
+    levels: Float[Array, " level"]
+    deviation: Float[Array, "level coordinate"]
+    threshold: Means
+
+    def init(self) -> InnovationState:
+        """Return the state before the first measurement."""
+        size = self.deviation.shape[1]
+        return InnovationState(
+            expected=jnp.zeros(size),
+            comparable=jnp.zeros(size, bool),
+            level=jnp.zeros(()),
+            means=jnp.zeros((len(WINDOWS), size)),
+            alarm=jnp.asarray(False),
+        )
+
+    def update(
+        self,
+        state: InnovationState,
+        xi: PathState,
+        measured: Bool[Array, " coordinate"],
+    ) -> tuple[InnovationState, Scalar]:
+        """Return the state after a measurement, and the statistic.
+
+        Args:
+            state: before.
+            xi: measured.
+            measured: its entries that are believed; the others are not compared.
+        """
+        used = measured & state.comparable
+        innovation = jnp.where(used, xi - state.expected, 0.0)
+        means = self.moved(state.means, innovation, state.level)
+        # Held, not towards zero: a sensor that fails must not end an alarm.
+        means = jnp.where(used, means, state.means)
+        statistic = jnp.max(jnp.abs(means) / self.threshold)
+        alarm = statistic > jnp.where(state.alarm, RELEASE, 1.0)
+        return state._replace(means=means, alarm=alarm), statistic
+
+    def moved(self, means: Means, innovation: PathState, level: Scalar) -> Means:
+        """Return the moving means with one more innovation."""
+        deviation = jax.vmap(lambda column: jnp.interp(level, self.levels, column))
+        score = innovation * self.deviation[0] / deviation(self.deviation.T) ** 2
+        return means + jnp.asarray(WINDOWS)[:, None] * (score - means)
+
+
+def innovation_test(document: Mapping[str, Any]) -> InnovationTest:
+    """Return the test from its entry of a certificate."""
+    entries = (document[name] for name in InnovationTest._fields)
+    return InnovationTest(*(jnp.asarray(entry, float) for entry in entries))
+
+
+def expected_coordinates(
+    model: Model, fiber: Fiber, xi: PathState, nu: Control, road: Float[Array, " 2"]
+) -> PathState:
+    """Return the ξ that the nominal model expects one step after a measured one."""
+    latent = model.encode(fiber, path_state(xi))
+    after = model.step(fiber, latent, jnp.concatenate([nu, road]))
+    return model.decode(fiber, after)[BODY]
+
+
+def steering_level(law: PathLaw, road: Float[Array, " 2"], env: Environment) -> Scalar:
+    """Return the law's steering per heading error.
+
+    The less the tyres give, the more the law steers and the larger are the errors of a
+    model: one number for how near a turn is to the limit of grip.
+    """
+    return jnp.abs(law.turn(road[0], road[1], env).gain[0, HEADING])
