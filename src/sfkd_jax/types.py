@@ -238,7 +238,9 @@ class ControllerInfo(TypedDict, total=False):
     measured: Bool[Array, " coordinate"]  # which of ξ is measured, not predicted
     dead_reckoning: Bool[Array, ""]  # some of it is predicted
     innovation: Float[Array, " coordinate"]  # measured less predicted ξ
-    trusted: Bool[Array, ""]  # on time, and no unexplained measurement of late
+    innovation_statistic: Scalar  # of the test, above 1 an alarm; NaN without a test
+    innovation_alarm: Bool[Array, ""]  # not the vehicle or sensors of the calibration
+    trusted: Bool[Array, ""]  # on time, no alarm, no unexplained measurement of late
     # Adaptation
     env_estimate: Float[Array, " environment"]  # the e planned with
     causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns

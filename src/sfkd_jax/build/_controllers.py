@@ -43,7 +43,7 @@ QUADRATIC = ("koopman_mpc",)
 _DECIDED = (
     *("dt", "wheelbase", "speed_loop", "control_low", "control_high"),
     *("env_low", "env_high", "estimate_env", "inner", "model", "law", "unroll"),
-    *("conditions", "reads_env"),
+    *("conditions", "reads_env", "test"),
 )
 """Arguments of controllers that vehicle, environment and model decide, and those for
 programs that build their own.
@@ -252,6 +252,7 @@ def build_controller(
         horizon=searches.horizon,
         conditions=_conditions(law, certificate, env_low, env_high),
         reads_env=not estimates,
+        test=None if estimates else _test(certificate),
         **arguments(searches.gate, control.Gate),
     )
     # Here and nowhere else observation and reference become ξ and preview.
@@ -321,6 +322,12 @@ def in_corridor(
         control=(plant.control_low, plant.control_high),
         conditions=_conditions(law, certificate),
     ).controller()
+
+
+def _test(certificate: Mapping[str, Any] | None) -> control.InnovationTest | None:
+    """The test of a certificate; None for one without: it was made before there was."""
+    entry = ((certificate or {}).get("corridor") or {}).get("innovations")
+    return entry and control.innovation_test(entry)
 
 
 def _sensors(corridor: Mapping[str, Any]) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from sfkd_jax.types import BODY, Key, Model, Params, Trajectory
 
 BATCHES = 10
 """Simulations of all runs for the calibration; half of them fix the units."""
-SHARES = (0.5, 0.75, 0.9, 0.95, 0.98)
+SHARES = (0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999)
 """Of the steps in order of their level, where another deviation begins."""
 DAY = 86_400.0
 """Time of driving to one false alarm [s]."""
@@ -94,7 +94,7 @@ def calibrate_innovations(
     )
     order = np.argsort(level, axis=None)
     sizes = np.asarray(SHARES) * len(order)
-    groups = np.split(order, sizes.astype(int))
+    groups = [part for part in np.split(order, sizes.astype(int)) if len(part)]
     steps = innovation.reshape(len(order), -1)
     levels = np.asarray([np.mean(level.ravel()[group]) for group in groups])
     deviation = [np.sqrt(np.mean(steps[group] ** 2, axis=0)) for group in groups]

@@ -15,19 +15,24 @@ from jaxtyping import Array, Bool, Float, Int
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
+from sfkd_jax.control.wrappers._estimator import input_error
+from sfkd_jax.control.wrappers._innovations import (
+    InnovationState,
+    InnovationTest,
+    expected_coordinates,
+    steering_level,
+)
 from sfkd_jax.geometry import (
     HEADING,
     LATERAL,
     PATH_SPEED,
     PathState,
     is_valid,
-    path_state,
     wrap_angle,
 )
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
-    BODY,
     Control,
     Controller,
     ControllerInfo,
@@ -92,6 +97,7 @@ class GateState(NamedTuple):
         env: the last finite environment.
         road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
             NaN before the first one.
+        test: of the innovations, or None.
     """
 
     inner: Any
@@ -102,6 +108,7 @@ class GateState(NamedTuple):
     doubt: Int[Array, ""]
     env: Environment
     road: Float[Array, "preview 2"]
+    test: InnovationState | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,9 +131,10 @@ class Gate:
 
     `info` gains `measured` (coordinate,), `dead_reckoning` (a coordinate is not
     measured), `innovation` ξ − ξ⁻ (coordinate,; NaN without comparison), `path_state`
-    (ξ where it is measured, else NaN) and `trusted` (the last call was one period ago,
-    e and reference are finite, and there is no trial). `healthy` is False unless all
-    of it is measured and trusted.
+    (ξ where it is measured, else NaN), `innovation_statistic` (of `test`; NaN without
+    one), `innovation_alarm` (the vehicle or its sensors are not those of the test) and
+    `trusted` (the last call was one period ago, e and reference are finite, there is
+    no trial and no alarm). `healthy` is False unless all of it is measured and trusted.
 
     Attributes:
         inner: controller along a path.
@@ -136,6 +144,7 @@ class Gate:
         conditions: where the model predicts.
         horizon: number of steps of the preview.
         reads_env: whether `inner` reads the environment that it is given.
+        test: of the innovations, with what `inner` estimates taken into account.
         patience: longest time on the nominal model [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
@@ -150,6 +159,7 @@ class Gate:
     horizon: AtLeastOne
     conditions: Conditions = ANYWHERE
     reads_env: bool = True
+    test: InnovationTest | None = None
     patience: Positive = 2.0
     trial: Positive = 10.0
     share: Positive = 0.6
@@ -177,6 +187,7 @@ class Gate:
             doubt=jnp.zeros((), jnp.int32),
             env=middle,
             road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
+            test=self.test and self.test.init(),
         )
 
     def act(
@@ -215,7 +226,11 @@ class Gate:
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
-        trusted = preview.trusted & on_time & (doubt == 0) & readable & env_known
+        tested, statistic, alarm = self._tested(
+            state.test, coordinates, measured & on_time
+        )
+        clear = on_time & readable & env_known
+        trusted = preview.trusted & clear & (doubt == 0) & ~alarm
         missing = jnp.where(measured, 0, state.missing + 1)
         xi = jnp.where(measured, coordinates, expected)
         # Nothing to believe and nothing to rely on: stop.
@@ -233,14 +248,20 @@ class Gate:
         estimate = jnp.where(measured & compared & plausible, estimate, xi)
         acting = info.get("env_estimate", known)
         ahead, modelled = self._predict(params, estimate, control, road[0], acting)
-        clean = jnp.all(measured) & trusted
+        clean = jnp.all(measured)
+        if tested is not None:
+            tested = self._compared_next(
+                tested, params, xi, control, road[0], acting, info, clear & clean
+            )
         report: Any = {
             **info,
-            "healthy": info.get("healthy", True) & clean,
+            "healthy": info.get("healthy", True) & clean & trusted,
             "measured": measured,
-            "dead_reckoning": compared & ~jnp.all(measured),
+            "dead_reckoning": compared & ~clean,
             "innovation": jnp.where(measured, innovation, jnp.nan),
             "path_state": jnp.where(measured, coordinates, jnp.nan),
+            "innovation_statistic": statistic,
+            "innovation_alarm": alarm,
             "trusted": trusted,
             "env_inside": info.get("env_inside", True) & env_known,
         }
@@ -253,6 +274,7 @@ class Gate:
             doubt=jnp.maximum(doubt - 1, 0),
             env=known,
             road=road,
+            test=tested,
         )
         return control, after, report
 
@@ -260,6 +282,46 @@ class Gate:
         """How far the vehicle gets in a step, and somewhat more [m]."""
         speed = jnp.abs(state.expected[PATH_SPEED])
         return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
+
+    def _tested(
+        self,
+        state: InnovationState | None,
+        xi: PathState,
+        measured: Bool[Array, " coordinate"],
+    ) -> tuple[InnovationState | None, Scalar, Bool[Array, ""]]:
+        """The test after this measurement, its statistic, and whether it alarms."""
+        if self.test is None or state is None:
+            return None, jnp.asarray(jnp.nan), jnp.asarray(False)
+        state, statistic = self.test.update(state, xi, measured)
+        return state, statistic, state.alarm
+
+    def _compared_next(
+        self,
+        state: InnovationState,
+        params: Params,
+        xi: PathState,
+        control: Control,
+        road: Float[Array, " 2"],
+        env: Environment,
+        info: ControllerInfo,
+        clear: Bool[Array, ""],
+    ) -> InnovationState:
+        """The test with what the next measurement is compared with."""
+        # What an estimator has found and counteracts is not found again.
+        if "causes" in info:
+            control = control + input_error(info["causes"], road)
+        nearest = self.conditions.nearest(env)
+        fiber = self.model.fiber(fold(self.model, params), nearest)
+        nu = control - self.law(xi, road[0], road[1], nearest)
+        expected = expected_coordinates(self.model, fiber, xi, nu, road)
+        # Beyond what data and planners add to the law, the model was not learned.
+        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+        clear &= usual & self.conditions.hold(xi, road) & all_finite(expected)
+        return state._replace(
+            expected=jnp.where(clear, expected, 0.0),
+            comparable=jnp.full(xi.shape, clear),
+            level=steering_level(self.law, road, nearest),
+        )
 
     def _limit(
         self, state: GateState, expected: PathState, periods: Scalar
@@ -292,9 +354,7 @@ class Gate:
         nearest = self.conditions.nearest(env)
         fiber = model.fiber(fold(model, params), nearest)
         nu = control - self.law(xi, road[0], road[1], nearest)
-        latent = model.encode(fiber, path_state(xi))
-        after = model.step(fiber, latent, jnp.concatenate([nu, road]))
-        ahead = model.decode(fiber, after)[BODY]
+        ahead = expected_coordinates(model, fiber, xi, nu, road)
         inside = self.conditions.hold(xi, road) & all_finite(ahead)
         sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
         return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside
