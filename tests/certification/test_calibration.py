@@ -6,6 +6,7 @@ import pytest
 from helpers import driven, model_and_params
 
 from sfkd_jax.certification._measured import (
+    alarm_thresholds,
     conformal_bounds,
     coverage,
     coverage_interval,
@@ -115,3 +116,11 @@ def test_position_and_yaw_disturbances_are_those_of_the_pose_increment():
     states[2, 4:, 2] += 0.1
     turned = largest(data._replace(states=jnp.asarray(states)))
     np.testing.assert_allclose(turned[2], [0.0, 0.5, 0.1, 0.0], atol=1e-5)
+
+
+def test_thresholds_are_exceeded_as_rarely_as_asked():
+    random = np.random.default_rng(0)
+    draw = lambda count: random.standard_exponential((count, 3)) * [1.0, 20.0, 0.1]
+    thresholds = alarm_thresholds(draw(2000), draw(2000), rate=1e-3)
+    share = np.mean(np.any(draw(200_000) > thresholds, axis=1))
+    assert 5e-4 < share < 2e-3

@@ -517,6 +517,28 @@ def test_after_its_patience_a_measurement_is_believed_and_nothing_claimed_for_a_
     assert not np.any(info["shield_healthy"][40 : believed + 30])
 
 
+def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause():
+    """A push of the heading over 2 s, each step as small as the class's own."""
+    pushed = np.random.default_rng(3).choice([-0.3, 0.3], (160, 3)) * DISTURBANCE
+    pushed[40:60, 1] += 0.6 * DISTURBANCE[1]
+    weights = np.asarray(control.WINDOWS)[:, None]
+    test = control.InnovationTest(
+        levels=jnp.zeros(1),
+        deviation=jnp.asarray(DISTURBANCE, float)[None],
+        threshold=jnp.asarray(1.8 * np.sqrt(weights / (2.0 - weights)) * np.ones(3)),
+    )
+    blind = lambda o, k: jnp.where(between(k, 61, 66), jnp.nan, o)
+    _, info = told(blind, steps=160, disturbances=pushed, test=test)
+    alarm = np.asarray(info["innovation_alarm"])
+    assert not alarm[:41].any()
+    assert alarm[55:66].all()
+    assert not alarm[140:].any()
+    assert not np.any(info["healthy"][alarm])
+    assert np.isnan(np.asarray(info["corridor"])[alarm]).all()
+    assert np.all(np.isfinite(np.asarray(info["corridor"])[140:]))
+    assert np.all(info["healthy"][140:])
+
+
 def test_who_is_blind_for_good_brakes():
     xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=170)
     assert not np.any(info["healthy"][40:])

@@ -44,6 +44,7 @@ from sfkd_jax.control.wrappers._gate import Gate as Gate
 from sfkd_jax.control.wrappers._guard import FILTER_SCALES as FILTER_SCALES
 from sfkd_jax.control.wrappers._guard import Shield as Shield
 from sfkd_jax.control.wrappers._guard import safety_filter as safety_filter
+from sfkd_jax.control.wrappers._innovations import WINDOWS as WINDOWS
 from sfkd_jax.control.wrappers._innovations import InnovationTest as InnovationTest
 from sfkd_jax.control.wrappers._innovations import (
     expected_coordinates as expected_coordinates,

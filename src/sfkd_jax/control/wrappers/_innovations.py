@@ -42,14 +42,15 @@ class InnovationState(NamedTuple):
 class InnovationTest(NamedTuple):
     """Moving means of weighted one-step innovations, against calibrated thresholds.
 
-        r = ξ⁺ − F(ξ; u − law(ξ), κ, v_ref, e),   s = r σ_0 / σ(level)²
+        r = ξ⁺ − F(ξ; u − law(ξ), κ, v_ref, e)
+        s_i = r_i / σ_i(0) · min_j (σ_j(0) / σ_j(level))²
         m_w ← m_w + w (s − m_w),   statistic = max |m_w| / threshold_w
 
     r is from one measurement to the next, so that noise telescopes in a mean over w⁻¹
-    steps, and what lasts decides. The weight 1/σ² is that of the likelihood ratio of a
-    constant error in noise of changing size. Short windows detect a jump, long ones a
-    drift (geometric moving averages; Roberts, 1959). Above 1 the vehicle or its sensors
-    are not those of the calibration.
+    steps, and what lasts decides. The weight is that of the likelihood ratio of a
+    constant error in noise whose size changes, 1/σ². Short windows detect a jump, long
+    ones a drift (geometric moving averages; Roberts, 1959). Above 1 the vehicle or its
+    sensors are not those of the calibration.
 
     Attributes:
         levels: rising, of `steering_level`.
@@ -96,8 +97,11 @@ class InnovationTest(NamedTuple):
 
     def moved(self, means: Means, innovation: PathState, level: Scalar) -> Means:
         """Return the moving means with one more innovation."""
+        usual = self.deviation[0]
         deviation = jax.vmap(lambda column: jnp.interp(level, self.levels, column))
-        score = innovation * self.deviation[0] / deviation(self.deviation.T) ** 2
+        # Of all entries: where a model errs in one, it errs in others for a while.
+        ratio = jnp.max(deviation(self.deviation.T) / usual)
+        score = innovation / (usual * jnp.maximum(ratio, 1.0) ** 2)
         return means + jnp.asarray(WINDOWS)[:, None] * (score - means)
 
 
