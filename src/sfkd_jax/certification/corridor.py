@@ -187,11 +187,11 @@ def certify_corridor(
     bound = bounds["vehicle_to_nominal_position"]
     search = _Search(loop, claims["position"], bound, data, held, attack_steps)
     observe = jax.jit(partial(_observed, loop))
-    alarms = calibrate_innovations(
-        *(lambda key, kind=kind: observe(kind(key), key) for kind in kinds[2:]),
-        stream(ALARMS),
-        duration=duration,
+    seen, seen_s3 = (
+        lambda key, kind=kind: observe(kind(key), key) for kind in kinds[2:]
     )
+    key = stream(ALARMS)
+    alarms = calibrate_innovations(seen, seen_s3, key, duration=duration)
     return {
         "conditions": excited | conditions,
         "level": level,

@@ -386,12 +386,12 @@ def drive_along_path(
     return in_batches(one, (envs, keys), size=BATCH)
 
 
-def _sensor_keys(key: Key, steps: int) -> Key:
+def _sensor_keys(key: Key, steps: int) -> Array:
     """A key a step for the sensors of one run."""
     return jax.random.split(jax.random.fold_in(key, SENSORS), steps)
 
 
-def sensor_keys(key: Key, runs: int, steps: int) -> Key:
+def sensor_keys(key: Key, runs: int, steps: int) -> Array:
     """Return the keys that `drive_along_path` gave to `sensors`, (run, time).
 
     Without a burn-in, with its key; so that what the law measured can be drawn again.
