@@ -27,9 +27,7 @@ MARGIN = 1.25
 """On thresholds: the tail of real runs is somewhat heavier than an exponential."""
 DAY = 86_400.0
 """Time of driving to one false alarm [s]."""
-Observed: TypeAlias = tuple[
-    Float[Array, "run time coordinate"], Float[Array, "run time"]
-]
+Observed: TypeAlias = tuple[Float[Array, "run gap coordinate"], Float[Array, "run gap"]]
 """Innovations and levels."""
 
 
