@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from sfkd_jax.certification._alarms import BATCHES
 from sfkd_jax.certification._certificate import PRECISION, Certificate, verify
 from sfkd_jax.certification._claims import (
     CONSTANTS,
@@ -39,6 +40,7 @@ from sfkd_jax.certification._weights import (
     well_formed,
 )
 from sfkd_jax.certification.corridor import EXCITATION, LENGTH, ROAD_SETTINGS
+from sfkd_jax.control import WINDOWS
 from sfkd_jax.data import SCENARIOS, sizes_of_parts
 
 REPEATED = 1e-9
@@ -322,7 +324,10 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
     width = bounds["nominal"] + tube
     # Where all bounds held on all runs, nothing farther was seen.
     covered = corridor["coverage"] == 1.0
+    # Certificates that are older than the test of innovations have none.
+    tested = {"innovations"} & set(corridor)
     return {
+        **{name: _innovations(corridor, trained) for name in tested},
         "conditions": _conditions(document, trained),
         "level": Follows(d_bar["level"]),
         "runs": Measured(math.ceil(level / (1 - level) - ROUNDED), 10**6, int),
@@ -348,6 +353,21 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
         # No farther than the runs of the attack reach.
         "shield_horizon": Measured(1, LENGTH, int),
         "seconds": SECONDS,
+    }
+
+
+def _innovations(corridor: Mapping[str, Any], trained: Trained) -> Rule:
+    """The test of innovations: scales, thresholds and the alarms on new runs."""
+    size, runs = trained.law.gain.shape[-1], corridor["runs"]
+    levels = corridor["innovations"]["levels"]
+    return {
+        "levels": [Measured(low) for low in (0.0, *levels[:-1])],
+        "deviation": [[POSITIVE] * size] * len(levels),
+        # In standard deviations: a higher one would never be reached.
+        "threshold": [[Measured(SMALLEST, 100.0)] * size] * len(WINDOWS),
+        "calibration_runs": Follows(BATCHES * runs),
+        "runs": Follows(runs),
+        **dict.fromkeys(("alarms", "alarms_s3"), Measured(0, runs, int)),
     }
 
 
