@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
-from sfkd_jax.control.wrappers._estimator import input_error
+from sfkd_jax.control.wrappers._estimator import Applied, input_error
 from sfkd_jax.control.wrappers._innovations import (
     InnovationState,
     InnovationTest,
@@ -226,11 +226,9 @@ class Gate:
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
-        tested, statistic, alarm = self._tested(
-            state.test, coordinates, measured & on_time
-        )
+        tested, verdict = self._tested(state, coordinates, measured & on_time)
         clear = on_time & readable & env_known
-        trusted = preview.trusted & clear & (doubt == 0) & ~alarm
+        trusted = preview.trusted & clear & (doubt == 0) & ~verdict["innovation_alarm"]
         missing = jnp.where(measured, 0, state.missing + 1)
         xi = jnp.where(measured, coordinates, expected)
         # Nothing to believe and nothing to rely on: stop.
@@ -246,13 +244,10 @@ class Gate:
         # A believed outlier starts anew; noise is averaged.
         estimate = expected + self.gain * innovation
         estimate = jnp.where(measured & compared & plausible, estimate, xi)
-        acting = info.get("env_estimate", known)
-        ahead, modelled = self._predict(params, estimate, control, road[0], acting)
+        applied = Applied(control, road[0], info.get("env_estimate", known))
+        ahead, modelled = self._predict(params, estimate, applied)
         clean = jnp.all(measured)
-        if tested is not None:
-            tested = self._compared_next(
-                tested, params, xi, control, road[0], acting, info, clear & clean
-            )
+        tested = self._expect(tested, params, xi, applied, info, clear & clean)
         report: Any = {
             **info,
             "healthy": info.get("healthy", True) & clean & trusted,
@@ -260,8 +255,7 @@ class Gate:
             "dead_reckoning": compared & ~clean,
             "innovation": jnp.where(measured, innovation, jnp.nan),
             "path_state": jnp.where(measured, coordinates, jnp.nan),
-            "innovation_statistic": statistic,
-            "innovation_alarm": alarm,
+            **verdict,
             "trusted": trusted,
             "env_inside": info.get("env_inside", True) & env_known,
         }
@@ -284,29 +278,28 @@ class Gate:
         return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
 
     def _tested(
+        self, state: GateState, xi: PathState, measured: Bool[Array, " coordinate"]
+    ) -> tuple[InnovationState | None, dict[str, Array]]:
+        """The test after this measurement, and its entries of `info`."""
+        tested, statistic, alarm = None, jnp.asarray(jnp.nan), jnp.asarray(False)
+        if self.test is not None and state.test is not None:
+            tested, statistic = self.test.update(state.test, xi, measured)
+            alarm = tested.alarm
+        return tested, {"innovation_statistic": statistic, "innovation_alarm": alarm}
+
+    def _expect(
         self,
         state: InnovationState | None,
-        xi: PathState,
-        measured: Bool[Array, " coordinate"],
-    ) -> tuple[InnovationState | None, Scalar, Bool[Array, ""]]:
-        """The test after this measurement, its statistic, and whether it alarms."""
-        if self.test is None or state is None:
-            return None, jnp.asarray(jnp.nan), jnp.asarray(False)
-        state, statistic = self.test.update(state, xi, measured)
-        return state, statistic, state.alarm
-
-    def _compared_next(
-        self,
-        state: InnovationState,
         params: Params,
         xi: PathState,
-        control: Control,
-        road: Float[Array, " 2"],
-        env: Environment,
+        applied: Applied,
         info: ControllerInfo,
         clear: Bool[Array, ""],
-    ) -> InnovationState:
+    ) -> InnovationState | None:
         """The test with what the next measurement is compared with."""
+        if state is None:
+            return None
+        control, road, env = applied
         # What an estimator has found and counteracts is not found again.
         if "causes" in info:
             control = control + input_error(info["causes"], road)
@@ -342,14 +335,10 @@ class Gate:
         return limit
 
     def _predict(
-        self,
-        params: Params,
-        xi: PathState,
-        control: Control,
-        road: Float[Array, " 2"],
-        env: Environment,
+        self, params: Params, xi: PathState, applied: Applied
     ) -> tuple[PathState, Bool[Array, ""]]:
         """ξ one step later, and whether it is the model that says so."""
+        control, road, env = applied
         model = self.model
         nearest = self.conditions.nearest(env)
         fiber = model.fiber(fold(model, params), nearest)
