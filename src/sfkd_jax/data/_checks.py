@@ -452,12 +452,7 @@ def _first(
 ) -> Iterator[Finding]:
     """One line about the first of some rows or steps, and how many there are.
 
-    Args:
-        log: that they are of.
-        bad: one per row, or one per step, which is named by the row after it.
-        text: what is said of number k.
-        hint: after the number.
-        refused: whether the log is.
+    `bad` is one per row, or one per step, which is named by the row after it.
     """
     if bad.any():
         k = int(bad.argmax())

@@ -58,11 +58,7 @@ VISITED = 0.001
 
 
 def check_shares(shares: tuple[float, ...]) -> None:
-    """Check the shares of training, validation, calibration and test.
-
-    Raises:
-        ValueError: shares that are not four positive numbers of sum 1.
-    """
+    """Check the shares of training, validation, calibration and test."""
     if len(shares) != 4 or not min(shares) > 0 or not abs(sum(shares) - 1.0) <= 1e-6:
         raise ValueError(
             "dataset.shares must be four positive numbers of sum 1, "
@@ -79,19 +75,17 @@ def split(
     env_high: Float[Array, " environment"],
     scenarios: Int[Array, " segment"] | None = None,
 ) -> Dataset:
-    """Split trajectories at random into training, validation, calibration and test.
+    """Split a batch at random into training, validation, calibration and test.
+
+    An empty part, numbers that are not finite and an environment outside E are refused.
 
     Args:
         trajectories: a batch.
         key: consumed.
-        shares: of the four parts.
+        shares: of the four parts, positive and of sum 1.
         env_low: lower corner of E.
         env_high: upper corner of E.
         scenarios: index into `SCENARIOS` of every trajectory, or None.
-
-    Raises:
-        ValueError: shares that are not four positive numbers of sum 1, an empty part,
-            numbers that are not finite, or an environment outside E.
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
@@ -134,11 +128,7 @@ def environment_box(
 ) -> tuple[Float[Array, " environment"], Float[Array, " environment"]]:
     """Return the corners of E: as given, or as far as the environments reach.
 
-    Args:
-        envs: of all segments.
-        low: lower corner, or None.
-        high: upper corner, or None.
-        known: whether somebody measured them; E is wide otherwise.
+    E is wide if they are not `known`: nobody measured them.
     """
     values = np.asarray(envs).reshape(-1, np.shape(envs)[-1])
     corners: Iterable[Any] = (low, high)
@@ -151,13 +141,7 @@ def environment_box(
 
 
 class Piece(NamedTuple):
-    """Evenly sampled steps without a gap, or a stack of as long ones.
-
-    Attributes:
-        states: at every moment.
-        controls: at every moment but the last.
-        envs: at every moment but the last.
-    """
+    """Evenly sampled steps without a gap, or a stack of as long ones."""
 
     states: Float[np.ndarray, "*segment steps_plus_1 state"]
     controls: Float[np.ndarray, "*segment steps control"]
@@ -200,13 +184,8 @@ def segments(
     """Cut the pieces of every run end to end; the rest of a piece is dropped.
 
     Positions are relative to the first of a segment, and its yaw begins in (−π, π]:
-    float32 cannot resolve positions on Earth.
-
-    Returns:
-        The segments in the order of time, and the number of the run of each.
-
-    Raises:
-        ValueError: no piece is as long as a segment.
+    float32 cannot resolve positions on Earth. The segments come in the order of time,
+    with the number of the run of each.
     """
     cut: list[Piece] = []
     runs: list[int] = []
@@ -247,10 +226,6 @@ def assign_parts(
     Returns:
         The part of every segment, in the order of `PARTS`, and whether every run is in
         one part only.
-
-    Raises:
-        ValueError: shares that are not four positive numbers of sum 1, or too few
-            segments for them.
     """
     check_shares(shares)
     numbers, sizes = np.unique(runs, return_counts=True)
@@ -324,11 +299,7 @@ def windows(
     *,
     length: int,
 ) -> Trajectory:
-    """Cut one window of `length` steps per row, from its start.
-
-    Raises:
-        ValueError: windows longer than the trajectories.
-    """
+    """Cut one window of `length` steps per row, from its start."""
     if length > (steps := trajectories.controls.shape[1]):
         # A slice out of range would be shifted, not refused.
         raise ValueError(
@@ -408,12 +379,7 @@ def to_path(
 
 
 def check_on_path(trajectories: Trajectory) -> None:
-    """Refuse runs that left their path.
-
-    Raises:
-        ValueError: the number of runs with 1 − κ e_y ≤ 0.2 or states that are not
-            finite.
-    """
+    """Refuse runs with 1 − κ e_y ≤ 0.2 or states that are not finite."""
     lateral = trajectories.states[..., :-1, BODY.start]
     valid = jnp.all(is_valid(lateral, trajectories.controls[..., 2]), axis=-1)
     valid &= jnp.all(jnp.isfinite(trajectories.states), axis=(-2, -1))

@@ -43,15 +43,11 @@ IN_A_ROW = 10
 
 
 class LoggedDataset(NamedTuple):
-    """A data set of recorded runs.
-
-    Attributes:
-        dataset: its four parts.
-        coverage: {"state", "control", "environment"} -> channel -> `coverage`.
-    """
+    """A data set of recorded runs."""
 
     dataset: Dataset
     coverage: dict[str, dict[str, dict[str, float]]]
+    """{"state", "control", "environment"} -> channel -> `coverage`."""
 
 
 def from_logs(
@@ -373,10 +369,6 @@ def log_files(path: str) -> dict[str, Path]:
     """Return the logs of a file, a folder or a glob by the hash of their contents.
 
     They are in the order of the hashes: a data set does not depend on names of files.
-
-    Raises:
-        ValueError: none, files of another kind, or two with the same contents.
-        ArtefactError: one is a pipe, a device or a folder, or cannot be read.
     """
     if path in ("", "???"):
         raise ValueError(
@@ -411,11 +403,7 @@ def log_files(path: str) -> dict[str, Path]:
 
 
 def fingerprint(path: str) -> str:
-    """Return a hash of the contents of all logs of a path, whatever their names.
-
-    Raises:
-        ValueError: as for `log_files`.
-    """
+    """Return a hash of the contents of all logs of a path, whatever their names."""
     return hashlib.sha256("".join(log_files(path)).encode()).hexdigest()
 
 

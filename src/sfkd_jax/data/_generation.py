@@ -86,8 +86,6 @@ def generate(
         vehicle: the plant.
         driver: (state, next reference points) -> control before excitation.
         key: consumed.
-        segments: their number.
-        steps: of a segment.
         speed: range of the target speed [m/s].
         steering_excitation: range of the spread [rad].
         speed_excitation: the same for the second control [m/s² or m/s].
@@ -135,19 +133,10 @@ def generate_along_path(
 
     In the last two quarters a third of every entry of e lies at an end of its range, so
     that the corners of E are covered; switches are `SWITCHES` apart. Roads and ν are
-    those of `drive_along_path`.
+    those of `drive_along_path`, which has the other arguments.
 
     Args:
         loop: of `vehicle.along_path`.
-        key: consumed.
-        segments: their number.
-        steps: of a segment.
-        speed: see `drive_along_path`.
-        peak_curvature: see there.
-        wavelengths: see there.
-        lateral_acceleration: see there.
-        steering_excitation: see there.
-        speed_excitation: see there.
         env_low: lower corner of E.
         env_high: upper corner of E.
         held_out: see `generate`.
@@ -185,9 +174,7 @@ def segment_scenarios(
 ) -> Int[np.ndarray, " segment"]:
     """Return the scenario of every generated segment, as index into `SCENARIOS`.
 
-    Args:
-        segments: their number.
-        along_path: whether `generate_along_path` made them, instead of `generate`.
+    `generate_along_path` makes those `along_path`, `generate` the others.
     """
     counts = _counts(segments, along_path=along_path)
     return np.repeat(np.arange(len(counts), dtype=np.int32), list(counts.values()))
@@ -218,12 +205,7 @@ def _schedules(
 
 
 def from_s3(steps: int, dt: float) -> Conditions:
-    """Return the schedule of S3, from a random time of it.
-
-    Args:
-        steps: of a run.
-        dt: sampling period [s].
-    """
+    """Return the schedule of S3, from a random time of it."""
 
     def conditions(key: Key) -> Float[Array, "time 2"]:
         road_key, moment_key = jax.random.split(key)

@@ -133,10 +133,7 @@ class Log:
     def gaps(self, gap: float, dt: float) -> Bool[np.ndarray, " step"]:
         """Return the steps that are too long to be bridged.
 
-        Args:
-            gap: the longest wait that is bridged, in periods: of the log or dt,
-                whichever is longer.
-            dt: of the model [s].
+        `gap` is the longest that is, in periods: of the log or dt, whichever is longer.
         """
         return (self.waits > gap * max(self.period, dt)) & self.joined
 
@@ -300,10 +297,10 @@ def read_logs(
     needs_environment: bool,
     blanks: bool = False,
 ) -> tuple[list[Log], list[str], list[str]]:
-    """Read all runs of some files.
+    """Read all runs of csv, npz and parquet files.
 
     Args:
-        files: csv, npz and parquet.
+        files: to read.
         columns: their names.
         dt: the period of npz arrays x, u, e without a time [s].
         needs_environment: whether the environment must be in the files; otherwise
@@ -313,9 +310,6 @@ def read_logs(
     Returns:
         All runs, in the order of the files; one line per file that could not be read;
         conversions of columns to SI units.
-
-    Raises:
-        ValueError: invalid names of columns.
     """
     _check_columns(columns, needs_environment)
     logs, errors, conversions = [], [], []
@@ -386,11 +380,7 @@ def _table(file: Path, columns: Columns, dt: float, blanks: bool) -> Table:
 def _stacked(
     source: str, arrays: dict[str, np.ndarray], columns: Columns, dt: float
 ) -> Table:
-    """Arrays x (run, time + 1, state), u and e (run, time, entry) below each other.
-
-    Raises:
-        ValueError: arrays of other shapes, or that are no numbers.
-    """
+    """Arrays x (run, time + 1, state), u and e (run, time, entry) below each other."""
     parts = {"x": columns.state, "u": columns.control, "e": columns.environment}
     if "e" not in arrays or not columns.environment:
         del parts["e"]
@@ -427,11 +417,7 @@ def _stacked(
 def _logs(
     table: Table, columns: Columns, needs_environment: bool
 ) -> tuple[list[Log], list[str]]:
-    """The runs of a table in SI units, and the conversions.
-
-    Raises:
-        ValueError: a column is missing or has an unknown unit.
-    """
+    """The runs of a table in SI units, and the conversions."""
     source, run = table.source, table.run or columns.run
     wanted = {
         "time": (columns.time,),

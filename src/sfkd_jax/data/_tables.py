@@ -80,14 +80,9 @@ class Table(NamedTuple):
     run: str | None = None
 
     def numbers(self, name: str, factor: float = 1.0) -> Float[np.ndarray, " time"]:
-        """Return a column as float64; dates become seconds since the first.
+        """Return a column, times the factor to its SI unit, as float64.
 
-        Args:
-            name: of the column.
-            factor: to its SI unit.
-
-        Raises:
-            ValueError: the first cell that is not a number.
+        Dates become seconds since the first.
         """
         values = self.columns[name]
         try:
@@ -135,10 +130,6 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
         file: as UTF-8, UTF-16 with its mark, or else Windows-1252.
         wanted: names of columns; the header is the line that has most of them.
         blanks: whether empty cells are NaN; otherwise they are text.
-
-    Raises:
-        ValueError: not text, no header, no rows, or rows of another length than the
-            header.
     """
     with _optional("pyarrow", f"{file}: csv files need"):
         from pyarrow import csv
@@ -209,9 +200,6 @@ def _header(
     """The index of the line that has most of the configured names.
 
     Without any it is the first that is no comment, if it is as long as a row.
-
-    Raises:
-        ValueError: there is no header.
     """
     # numpy writes headers as comments.
     heads = {k: _cells(lines[k].lstrip("# "))[0] for k in filled[:PREAMBLE]}
@@ -236,11 +224,7 @@ def among(headers: Iterable[str], wanted: Collection[str]) -> list[str]:
 
 
 def _text(file: Path) -> str:
-    """The text of a file, by its byte order mark, as UTF-8, or else Windows-1252.
-
-    Raises:
-        ValueError: zeros, which no text has.
-    """
+    """The text of a file, by its byte order mark, as UTF-8, or else Windows-1252."""
     with open_regular(file) as stream:
         content = stream.read()
     encoding = "utf-8-sig"
@@ -275,12 +259,7 @@ def _is_number(value: Any) -> bool:
 
 
 def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
-    """Return the arrays of an npz file.
-
-    Raises:
-        ValueError: damaged, of another kind, with objects, or larger than DECODED bytes
-            once inflated.
-    """
+    """Return the arrays of an npz file, of at most DECODED bytes and no objects."""
     with _opened(file, "npz") as stream:
         with zipfile.ZipFile(stream) as packed:
             _check_decoded(sum(part.file_size for part in packed.infolist()))
@@ -291,12 +270,7 @@ def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
 
 
 def read_parquet(file: Path, wanted: Collection[str]) -> Table:
-    """Read the configured columns of a parquet file.
-
-    Raises:
-        ValueError: pyarrow is missing, the file is damaged or of another kind, or
-            larger than DECODED bytes once decoded.
-    """
+    """Read the configured columns of a parquet file, of at most DECODED bytes."""
     with _optional("pyarrow", f"{file}: parquet files need"):
         from pyarrow import parquet
     with _opened(file, "parquet") as stream:
@@ -354,18 +328,8 @@ def find_column(
     """Find the column of a file that a configured name stands for.
 
     A column of exactly this name comes first, then one that has a unit behind it. A
-    configured name that holds the unit itself is converted if the unit is known.
-
-    Args:
-        name: as configured.
-        headers: of the file.
-        dimension: of `DIMENSIONS` that the column must have; None for any.
-
-    Returns:
-        The match, or None where there is no such column.
-
-    Raises:
-        ValueError: an unknown unit, one of another dimension, or two such columns.
+    configured name that holds the unit itself is converted if the unit is known. It
+    must be of the dimension, of `DIMENSIONS`, unless that is None.
     """
     exact, fitting = name in headers, [name]
     if not exact:
@@ -398,11 +362,8 @@ def find_column(
 
 @cache
 def find_unit(symbol: str) -> tuple[str, float] | None:
-    """Return the dimension of a unit and its factor to SI; None if it is unknown.
-
-    Args:
-        symbol: as written; small letters are tried second.
-    """
+    """Return the dimension of a unit and its factor to SI; None if it is unknown."""
+    # As written first: units may differ in capitals, such as mm and Mm.
     for spelling in (symbol, symbol.lower()):
         written = SPELLINGS.get(spelling, spelling)
         if not WRITTEN.fullmatch(written) and written != "standard_gravity":
@@ -421,11 +382,7 @@ def find_unit(symbol: str) -> tuple[str, float] | None:
 
 @cache
 def _registry() -> tuple[Any, dict[str, str]]:
-    """Pint's units, and the dimension of every SI unit in base units.
-
-    Raises:
-        ValueError: pint is not installed.
-    """
+    """Pint's units, and the dimension of every SI unit in base units."""
     with _optional("pint", "units in column names need"):
         import pint
     units = pint.UnitRegistry()
