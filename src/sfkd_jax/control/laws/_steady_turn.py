@@ -78,13 +78,15 @@ class SteadyTurn(NamedTuple):
         errors = jnp.abs(coordinates[: PATH_SPEED + 1] - self.state[: PATH_SPEED + 1])
         away = jnp.min(jnp.max(errors / jnp.asarray(NEAR), axis=1))
         share = jnp.clip(away - 1.0, 0.0, 1.0)
-        far = approach(self, coordinates)
+        far = approach(self, self.grip, coordinates)
         # A choice, not a mixture with weight 0: near the path the law is bit for bit
         # the linear one, around which models are learned and certified.
         return jnp.where(share > 0.0, linear + share * (far - linear), linear)
 
 
-def approach(turn: SteadyTurn, coordinates: PathState) -> Control:
+def approach(
+    turn: SteadyTurn, grip: Float[Array, " 2"], coordinates: PathState
+) -> Control:
     """Return the control far from the path, which brings the vehicle back to it.
 
         ψ* = −sign(e_y) min(K_y/K_ψ |e_y|, √(2 |e_y| / R), `STEEPEST`),   R ~ v²/a
@@ -95,13 +97,14 @@ def approach(turn: SteadyTurn, coordinates: PathState) -> Control:
     points the right way; steering and drive share the grip a.
 
     Args:
-        turn: with `grip`.
+        turn: whose state, control and gain are used.
+        grip: see `SteadyTurn`.
         coordinates: ξ.
     """
     errors = coordinates - turn.state
-    slope, grip = turn.grip[0], turn.grip[1]
+    slope, available = grip[0], grip[1]
     speed = jnp.maximum(jnp.abs(coordinates[PATH_SPEED]), 1.0)
-    sideways, radius = jnp.abs(errors[LATERAL]), speed**2 / (ARC * grip)
+    sideways, radius = jnp.abs(errors[LATERAL]), speed**2 / (ARC * available)
     steering, drive = turn.gain[0], turn.gain[1]
 
     # A law that does not steer has no approach.
@@ -115,16 +118,16 @@ def approach(turn: SteadyTurn, coordinates: PathState) -> Control:
     ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
     rest = steering[PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
     wanted = ahead - steering[HEADING] * jnp.clip(turned, -TURN, TURN) - DAMPING * rest
-    most = slope * CORNERING * grip / speed**2 + 0.01
+    most = slope * CORNERING * available / speed**2 + 0.01
     wanted = jnp.clip(wanted, -most, most)
 
     reference = turn.state[PATH_SPEED]
-    slow = jnp.minimum(reference, jnp.sqrt(CIRCLE * slope * grip))
+    slow = jnp.minimum(reference, jnp.sqrt(CIRCLE * slope * available))
     astray = jnp.clip((jnp.abs(turned) - SLOWER[0]) / SLOWER[1], 0.0, 1.0)
     away = jnp.clip((sideways - DISTANT[0]) / DISTANT[1], 0.0, 1.0)
     target = reference + (slow - reference) * jnp.maximum(astray, away)
     # What cornering uses of the friction circle is missing for the drive.
-    used = jnp.clip(jnp.abs(wanted) * speed**2 / (slope * grip), 0.0, 1.0)
+    used = jnp.clip(jnp.abs(wanted) * speed**2 / (slope * available), 0.0, 1.0)
     left = jnp.sqrt(1.0 - SHARED * used**2)
     error = jnp.clip(
         coordinates[PATH_SPEED] - target,

@@ -32,6 +32,7 @@ from sfkd_jax.geometry import (
     PathState,
     between,
     curvature_ahead,
+    followable,
     path_coordinates,
     path_state,
 )
@@ -121,6 +122,7 @@ class AlongReference:
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
         """Take one control step."""
         precise = check_path(observation, env, reference, reference.shape[0])
+        reference, known = followable(reference)
         curvature = curvature_ahead(reference)
         xi = path_coordinates(observation, reference[0], curvature[0])
         road = jnp.stack([curvature, reference[:, 3]], axis=1)
@@ -136,7 +138,7 @@ class AlongReference:
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
-            trusted=precise,
+            trusted=precise & known,
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info["predicted_states"]
@@ -144,7 +146,7 @@ class AlongReference:
         info: Any = {"path_state": xi, **info, "planned_path": planned}
         info["precision"] = precise
         if "healthy" in info:
-            info["healthy"] &= precise
+            info["healthy"] &= precise & known
         info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
         return control, AlongReferenceState(inner, observation), info
 
