@@ -244,26 +244,40 @@ def build_controller(
         options = arguments(searches.adaptation, control.Adaptation)
         adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
         along = adaptation.controller()
-    gate = control.Gate(
-        inner=along,
-        model=model,
-        law=law,
-        dt=plant.dt,
-        horizon=searches.horizon,
-        conditions=_conditions(law, certificate, env_low, env_high),
-        reads_env=not estimates,
-        test=None if estimates else _test(certificate),
-        **arguments(searches.gate, control.Gate),
-    )
-    # Here and nowhere else observation and reference become ξ and preview.
-    controller = control.along_reference(
-        gate.controller(), coordinates=law.gain.shape[-1]
-    )
+    conditions = _conditions(law, certificate, env_low, env_high)
+    test = None if estimates else _test(certificate)
+    controller = _gated(along, searches, model, plant, law, conditions, test, estimates)
     if planner or not adaptive:
         return controller
     options = arguments(searches.online_tube, control.OnlineTube)
     tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)
     return tube.controller()
+
+
+def _gated(
+    inner: Controller,
+    settings: SearchSettings,
+    model: Model,
+    plant: plants.Vehicle,
+    law: control.PathLaw,
+    conditions: control.Conditions,
+    test: control.InnovationTest | None,
+    estimates: bool,
+) -> Controller:
+    """Return a controller along a path behind the gate of its measurements."""
+    gate = control.Gate(
+        inner=inner,
+        model=model,
+        law=law,
+        dt=plant.dt,
+        horizon=settings.horizon,
+        conditions=conditions,
+        reads_env=not estimates,
+        test=test,
+        **arguments(settings.gate, control.Gate),
+    )
+    # Here and nowhere else observation and reference become ξ and preview.
+    return control.along_reference(gate.controller(), coordinates=law.gain.shape[-1])
 
 
 def _task(
