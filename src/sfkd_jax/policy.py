@@ -165,10 +165,10 @@ class Policy(TrainedModel):
                 "this policy has no certified corridor to keep a planner in: load one "
                 "in path coordinates with its certificate, as pretrained/dynamic_path"
             )
-        if along_path:
-            return _entrance(self.around(planner=planner), self)
-        guard = self.around(planner=REQUEST)
-        return _entrance(behind(guard, planner), self)
+        # Its settings are numbers, also where a program is traced when it is built.
+        with jax.ensure_compile_time_eval():
+            guard = self.around(planner=planner if along_path else REQUEST)
+        return _entrance(guard if along_path else behind(guard, planner), self)
 
     def __reduce__(self) -> Any:
         """Refuse to be pickled; functions of a closure say less clearly why."""
