@@ -123,7 +123,7 @@ def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
     for (name, values), color, dash in looks:
         if values:
             # As floats, null is NaN: a gap in the curve.
-            look = {"label": name, "color": color, "linestyle": dash}
+            look: Any = {"label": name, "color": color, "linestyle": dash}
             axes.plot(ahead, np.asarray(values, float), **look)
     axes.set(ylabel="error of position [m]", xlim=(0, ahead[-1]))
     axes.set_xlabel("time ahead [s]" if known else "steps ahead")
