@@ -1,4 +1,4 @@
-"""Models in continuous time: solver order, symmetry, affine inputs, use of e."""
+"""Models in continuous time: known dynamics, affine inputs, exact activations."""
 
 from functools import cache, partial
 
@@ -11,10 +11,8 @@ import scipy.special
 from helpers import jit, space
 
 from sfkd_jax import models, plants
-from sfkd_jax.geometry import compose
-from sfkd_jax.models._continuous import Rates, continuous
 from sfkd_jax.models._icode import softplus
-from sfkd_jax.types import BODY, POSE
+from sfkd_jax.types import POSE
 
 LEARNED = ("neural_ode", "icode", "icode_mppi")
 SIZES = {
@@ -57,56 +55,6 @@ def drawn(name, body=1):
 @partial(jit, static_argnums=0)
 def stepped(model, params, state, control=CONTROL, env=ENV):
     return model.step(model.fiber(params, env), state, control)
-
-
-@pytest.mark.usefixtures("x64")
-def test_the_step_is_the_exact_flow_of_a_linear_model_to_the_fourth_order():
-    """Each halving of dt divides the error over one second by 16; pose included, since
-    it turns at a constant rate.
-    """
-    random = np.random.default_rng(0)
-    linear, turning = random.standard_normal((3, 3)), np.array([1.3, -0.4, 0.8])
-    scales = space(3)._replace(increment_mean=jnp.zeros(3), increment_scale=jnp.ones(3))
-    start, control = (
-        jnp.asarray([3.0, -1.0, 0.4, 12.0, 0.2, -0.3]),
-        jnp.asarray([0.3, 1.2]),
-    )
-    offset = np.array([0.5, 0.5, 0.0])
-
-    def errors(steps):
-        dt = 1.0 / steps
-        rates = lambda fiber, s, u: jnp.concatenate(
-            [turning * dt, linear @ s + fiber * u[0] * offset]
-        )
-        given = Rates(lambda key: {}, rates, fiber=lambda params, env: env[1])
-        model = continuous(scales, given, dt=dt)
-        state = start
-        for _ in range(steps):
-            state = stepped(model, {}, state, control)
-        scaled = (np.asarray(start[BODY]) - scales.body_mean) / scales.body_scale
-        constant = float((ENV[1] / 8.0) * (control[0] / 0.2)) * offset
-        system = np.block([[linear, constant[:, None]], [np.zeros((1, 4))]])
-        body = (scipy.linalg.expm(system) @ np.append(scaled, 1.0))[:3]
-        back_and_forth = np.array(
-            [
-                [0.0, -turning[2], turning[0]],
-                [turning[2], 0.0, turning[1]],
-                [0.0, 0.0, 0.0],
-            ]
-        )
-        motion = scipy.linalg.expm(back_and_forth)[:2, 2]
-        pose = compose(start[POSE], jnp.asarray([*motion, turning[2]]))
-        scaled = (state[BODY] - scales.body_mean) / scales.body_scale
-        return (
-            np.linalg.norm(scaled - body),
-            np.linalg.norm(state[:2] - pose[:2]),
-            abs(state[2] - pose[2]),
-        )
-
-    coarse, fine = np.array(errors(10)), np.array(errors(20))
-    assert np.all(coarse[:2] > 1e-8)
-    np.testing.assert_allclose(coarse[:2] / fine[:2], 16.0, rtol=0.15)
-    np.testing.assert_allclose([coarse[2], fine[2]], 0.0, atol=1e-12)
 
 
 @pytest.mark.usefixtures("x64")

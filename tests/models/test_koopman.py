@@ -11,7 +11,7 @@ from helpers import at, dataset, jit, space
 from sfkd_jax import data as datasets
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._koopman import Lift, along_circle, ridge_regression
+from sfkd_jax.models._koopman import along_circle, ridge_regression
 from sfkd_jax.rollout import defects
 from sfkd_jax.types import POSE, Trajectory
 
@@ -113,38 +113,6 @@ def test_a_plant_that_varies_with_the_environment_is_recovered():
     )
     np.testing.assert_allclose(B[3:], (friction - 0.5) * G, atol=2e-4)
     np.testing.assert_allclose(c[3:], friction * BIAS, atol=2e-4)
-
-
-def test_a_plant_that_is_linear_in_the_lift_is_predicted_exactly():
-    """The lift of new states one step later, thin-plate functions included."""
-    lift = Lift(
-        space(), 20, 2, lateral_range=4.0, heading_range=0.5, curvature_range=0.03
-    )
-    random = np.random.default_rng(2)
-    centres, weights = (
-        jnp.asarray(random.uniform(-1, 1, shape), jnp.float32)
-        for shape in ((20, 3), (20 + 6 * 7, lift.rank))
-    )
-
-    @jit
-    @jax.vmap
-    def draw(key):
-        x, u, e, kappa = (
-            jax.random.uniform(k, (n,), minval=-1)
-            for k, n in zip(jax.random.split(key, 4), (4, 2, 2, 1), strict=True)
-        )
-        z = lift(centres, lift.centre + lift.scale * x)
-        return lift.regressors(
-            z,
-            0.2 * u,
-            jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * e,
-            0.03 * kappa[0],
-        )
-
-    seen, fresh = (draw(jax.random.split(key, 600)) for key in jax.random.split(KEY))
-    fitted = ridge_regression(seen, seen @ weights, jnp.asarray([1e-10]))[0]
-    np.testing.assert_allclose(fresh @ fitted, fresh @ weights, atol=2e-3)
-    assert float(jnp.std(fresh @ weights)) > 1
 
 
 def test_ridge_regression_minimises_its_objective():

@@ -84,14 +84,6 @@ def test_the_default_substeps_are_fine_enough(dynamic_plant, speed, hold):
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-3)
 
 
-def test_a_small_steering_step_is_a_first_order_lag(dynamic_plant, hold):
-    states = hold(dynamic_plant(), 10.0, (1e-3, 0.0), (0.9, 0.0), 0.5)
-    time = np.arange(6) * 0.1
-    np.testing.assert_allclose(
-        states[:, 6], 1e-3 * (1.0 - np.exp(-time / LAG)), rtol=1e-3
-    )
-
-
 @pytest.mark.parametrize("acceleration", [-4.0, 0.0, 2.0])
 def test_a_sliding_car_is_turned_by_the_load_that_braking_moves_forward(
     dynamic_plant, acceleration

@@ -63,22 +63,3 @@ def test_the_nominal_bicycle_drives_its_circle_whatever_road_and_weather(hold):
     assert float(ends[0][2]) == pytest.approx(20.0 * curvature, rel=1e-10)
     chord = 2.0 / curvature * np.sin(10.0 * curvature)
     assert float(jnp.linalg.norm(ends[0][:2])) == pytest.approx(abs(chord), rel=1e-3)
-
-
-def test_with_stiff_tyres_friction_is_felt_at_the_limit_alone():
-    """A gentle turn is the same on ice, a sharp one is not; with stiffnesses in
-    proportion to friction both differ.
-    """
-
-    def curvature(car, steering, friction):
-        state = jnp.array([0.0, 0.0, 0.0, 10.0])
-        env = jnp.array([friction, 0.0])
-        return float(car().derivative(state, jnp.array([steering, 0.0]), env)[2])
-
-    def change(car, steering):
-        return curvature(car, steering, 0.3) / curvature(car, steering, 0.9) - 1.0
-
-    assert (
-        abs(change(kinematic_stiff, 1e-4)) < 1e-4 < 0.05 < abs(change(kinematic, 1e-4))
-    )
-    assert change(kinematic_stiff, 0.2) < -0.3
