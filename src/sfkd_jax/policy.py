@@ -21,12 +21,7 @@ from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.settings import Values
-from sfkd_jax.types import (
-    Controller,
-    Key,
-    Model,
-    Params,
-)
+from sfkd_jax.types import Controller, Key, Model, Params
 
 KIND, LAW = "policy", "law"
 CERTIFICATE = "certificate.json"
@@ -156,9 +151,6 @@ class Policy(TrainedModel):
                 of the vehicle. Entries of its `info` appear in that of the guard.
             along_path: whether it takes ξ and a preview instead of observation and
                 reference, see `control.along_reference`.
-
-        Raises:
-            ValueError: the policy has no certified corridor.
         """
         if not (self.certificate and self.certificate.get("corridor")):
             raise ValueError(
@@ -197,15 +189,11 @@ def save(
     """Write policy.safetensors and return its manifest.
 
     Args:
-        path: of policy.safetensors.
+        path: of the file.
         params: weights.
         settings: that they were made with.
         made_from: hashes of the artefacts that they were made from.
         law: that a model in path coordinates was learned around, or None.
-
-    Returns:
-        The manifest; `sha256` is the hash of weights and law, `content_sha256` that of
-        weights, law and all settings.
     """
     # Beside the weights: the hash that certificates refer to then covers the law.
     tree = params if law is None else params | {LAW: law._asdict()}
@@ -392,11 +380,7 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
 def read_certificate(
     path: str | Path, trained: TrainedModel
 ) -> tuple[dict[str, Any] | None, str]:
-    """Verify the certificate beside a policy.
-
-    Args:
-        path: of the run directory, or of policy.safetensors.
-        trained: the policy.
+    """Verify the certificate beside a policy, in its run directory.
 
     Returns:
         The certificate and "", or None and the reason why there is none.

@@ -88,8 +88,7 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Any]:
     return {
         name: parameter.default
         for name, parameter in inspect.signature(factory).parameters.items()
-        # A NamedTuple takes its fields by position,
-        # a factory its settings by name alone.
+        # A NamedTuple takes fields by position, a factory its settings by name alone.
         if inspect.isclass(factory) or parameter.kind is parameter.KEYWORD_ONLY
     }
 

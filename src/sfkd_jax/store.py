@@ -70,10 +70,8 @@ def as_artefact_error(
 ) -> Iterator[None]:
     """Turn exceptions about a file or its content into an ArtefactError.
 
-    Args:
-        path: of the file; an OSError that names another file is about that one.
-        also: exceptions to convert besides OSError, missing keys and wrong types.
-        advice: appended to the message about content.
+    Those are OSError, missing keys, wrong types and `also`; `advice` follows what is
+    said about content. An OSError that names another file is about that one.
     """
     usual = (KeyError, TypeError, IndexError, AttributeError, OverflowError)
     try:
@@ -239,10 +237,8 @@ def read_arrays(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays of `path` and their manifest; nothing is ever unpickled.
 
-    Raises:
-        ArtefactError: the file is missing, truncated, damaged or foreign; the artefact
-            is of another kind or format, was made with other settings than `config`,
-            or arrays or settings do not match their hashes.
+    Another kind or format, other settings than `config`, and arrays or settings that do
+    not match their hashes are refused.
     """
     with _opened(path) as file:
         manifest = _manifest(path, kind, file)

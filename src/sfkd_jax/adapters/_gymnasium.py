@@ -111,11 +111,7 @@ class GymnasiumVehicle(gymnasium.Env):
         return np.clip(np.array(self._observe(road, moment)), space.low, space.high)
 
     def render(self) -> np.ndarray | None:  # pyright: ignore
-        """Return the image of the last step, uint8, if the mode is "rgb_array".
-
-        Raises:
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
+        """Return the image of the last step, uint8, if the mode is "rgb_array"."""
         if self.render_mode is None:
             gymnasium.logger.warn(
                 "render is called without a render_mode; pass render_mode to make"

@@ -94,10 +94,6 @@ class DrivingTask:
         steering_rate: q_δ̇ [s²/rad²].
         leaving: charged once [-]; standing still costs half of it at 10 m/s and a
             discount of 0.99.
-
-    Raises:
-        ValueError: an unknown name, a size, width or duration that is not positive, a
-            negative weight, or a family that is for another plant.
     """
 
     vehicle: str | Vehicle = "kinematic"

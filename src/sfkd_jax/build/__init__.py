@@ -82,11 +82,7 @@ VEHICLES = {
 
 
 def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
-    """Return the vehicle of the settings, with its inner loop.
-
-    Raises:
-        ValueError: a setting out of its range, or a step that does not exist.
-    """
+    """Return the vehicle of the settings, with its inner loop."""
     settings = parse(VehicleSettings, settings, "vehicle.")
     factory: Callable[..., plants.Vehicle] = PLANTS[settings.name]
     options = arguments(settings, factory)
@@ -109,13 +105,7 @@ class ScenarioSettings:
 def build_scenario(
     settings: ScenarioSettings | Values, plant: plants.Vehicle, *, duration: float
 ) -> scenarios.Family:
-    """Return the scenario family of the settings.
-
-    Args:
-        settings: the name of the family and its arguments.
-        plant: the vehicle that will drive.
-        duration: of an episode [s].
-    """
+    """Return the scenario family of the settings, with episodes of a duration [s]."""
     settings = parse(ScenarioSettings, settings, "scenario.")
     return scenarios.scenario(
         **arguments(settings, scenarios.scenario),
@@ -158,14 +148,6 @@ def build_model(
 
     Models with prior knowledge take it from the vehicle: the sampling period and the
     derivative of the nominal bicycle.
-
-    Args:
-        settings: the name of the factory and its arguments.
-        space: scales of states, controls and environments.
-        plant: the vehicle to be modelled.
-
-    Raises:
-        ValueError: an unknown model, or arguments that its factory refuses.
     """
     settings = parse(ModelSettings, settings, "model.")
     factory = MODELS[settings.name]
@@ -180,9 +162,6 @@ def check_imported(settings: Any) -> None:
     """Check that the code that stored settings name was imported by the caller.
 
     Modules of the standard library are imported by anybody, and no models.
-
-    Raises:
-        ValueError: `model.factory` is of a module that is not imported, or of Python.
     """
     model = settings.get("model") if isinstance(settings, Mapping) else None
     factory = model.get("factory") if isinstance(model, Mapping) else None
@@ -302,7 +281,7 @@ class System(NamedTuple):
     Attributes:
         model: that the controller predicts with.
         params: of the model.
-        env_source: where its environment comes from, see `ENV_SOURCES`.
+        env_source: one of `ENV_SOURCES`.
         certificate: verified, or None.
         law: that a model in path coordinates was learned around, or None.
     """
@@ -322,10 +301,6 @@ def reference_systems(
     "nominal" predicts with the bicycle, "oracle" with the true plant. With a law they
     describe its closed loop, in path coordinates; "law" is then the oracle once more,
     for a planner without samples (`num_samples=1`), so that the law drives alone.
-
-    Args:
-        plant: the true vehicle.
-        law: of path coordinates, or None.
     """
     plant = plant if law is None else build_loop(plant, law)
     physics = partial(models.physics, along_path=law is not None)

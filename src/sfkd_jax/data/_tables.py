@@ -179,8 +179,7 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
             # An empty cell is an error with a line, not a number. What nobody asked
             # for, such as text, would fill the memory.
             convert_options=csv.ConvertOptions(
-                null_values=[""] if blanks else [],
-                include_columns=among(names, wanted),
+                null_values=[""] if blanks else [], include_columns=among(names, wanted)
             ),
         )
     except (ValueError, OverflowError) as reason:

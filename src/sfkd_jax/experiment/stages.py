@@ -102,12 +102,7 @@ def _zero_law(sizes: Mapping[str, int]) -> PathLaw:
 
 
 def ensure_policy(settings: Settings) -> policy.TrainedModel:
-    """Return the policy of the run; train it, or continue training, if it is missing.
-
-    Raises:
-        ArtefactError: the run was made with other settings, is damaged, or is being
-            trained by another process.
-    """
+    """Return the policy of the run; train it, or train it on, if it is missing."""
     # Before the lock and the data: a missing module ends the command at once.
     if factory := getattr(settings.model, "factory", None):
         imported(factory, "model.factory")

@@ -13,12 +13,7 @@ from sfkd_jax.settings import arguments, plain
 
 
 def run(settings: Settings) -> dict[str, Any]:
-    """Export the policy of the run; nothing is trained or certified.
-
-    Raises:
-        ArtefactError: the run has no policy, or one that is damaged or was trained
-            with other settings.
-    """
+    """Export the policy of the run; nothing is trained or certified."""
     run_dir = settings.run_dir
     if not (run_dir / "policy.safetensors").is_file():
         raise store.ArtefactError(

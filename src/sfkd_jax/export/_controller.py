@@ -68,7 +68,7 @@ def write_controller(
     """Write a controller for processes without sfkd_jax, and return its manifest.
 
     Args:
-        trained: the policy to export.
+        trained: the policy.
         folder: to write; an earlier export in it is replaced.
         platforms: that the programs are compiled for.
         iree: whether to compile for C and C++ as well.

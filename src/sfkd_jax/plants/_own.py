@@ -43,10 +43,6 @@ def own(
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
             [m/s²].
         step: (x, u, e) -> x one sampling period later, pure and traceable by jax.
-
-    Raises:
-        ValueError: fewer than four states, or limits that are missing or not two
-            numbers each.
     """
     if len(state_names) < 4:
         raise ValueError(
@@ -88,16 +84,10 @@ def _no_step(state: State, control: Control, env: Environment) -> State:
 
 
 def step_named(name: str) -> Step:
-    """Return the step "package.module:function", imported at its first call.
-
-    Args:
-        name: of a function (x, u, e) -> x one sampling period later, as in
-            `vehicle.step`. If there is no such function, the call raises ValueError.
-    """
+    """Return the step "package.module:function", imported at its first call."""
 
     def step(state: State, control: Control, env: Environment) -> State:
-        # Imported at the call: a plant may be
-        # described where its code is not installed.
+        # At the call: a plant may be described where its code is not installed.
         try:
             function = imported(name, "vehicle.step")
         except ValueError as reason:
@@ -108,11 +98,7 @@ def step_named(name: str) -> Step:
 
 
 def check_step(plant: Vehicle) -> None:
-    """Evaluate a plant's step on shapes only.
-
-    Raises:
-        ValueError: there is no step, it fails, or it does not return a state.
-    """
+    """Refuse a step that is missing, fails or returns no state, from shapes only."""
     size = len(plant.state_names)
     given = f"{size} states (vehicle.state_names), 2 controls and 2 environments"
     try:

@@ -67,13 +67,7 @@ def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]
 def equivalent_wind(
     wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float
 ) -> Float[Array, ""]:
-    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F.
-
-    Args:
-        wind: w [m/s].
-        force: F [N].
-        wind_force: c_w [N s²/m²].
-    """
+    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F for a force F [N]."""
     # Forces add, winds do not: the law is a signed square.
     total = side_force(wind, wind_force=wind_force) + force
     # Exactly the same wind without a force, so that not a bit of an episode changes.
@@ -153,11 +147,8 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     a = clip(k_v (v_cmd − v)), held over dt.
 
     Args:
-        vehicle: any plant whose second control is an acceleration.
+        vehicle: with limits, whose second control is an acceleration.
         gain: k_v [1/s].
-
-    Raises:
-        ValueError: the vehicle takes speed commands already, or has no limits.
     """
     if vehicle.speed_loop or not vehicle.control_low:
         raise ValueError(
@@ -203,9 +194,6 @@ def along_path(
         law: (ξ, κ, v_ref, e) -> u.
         perturbation: largest |ν| [rad, control unit], the limits of w; steps do not
             enforce them.
-
-    Raises:
-        ValueError: the vehicle has no limits.
     """
     if not vehicle.control_low:
         raise ValueError(
@@ -226,10 +214,6 @@ def along_path(
         nominal=nominal,
         nominal_derivative=nominal_derivative,
         # Limits of w as boxes to draw from; the loop itself clips only the control.
-        control_low=(
-            *(-largest for largest in perturbation),
-            -STEEPEST,
-            SPEED_RANGE[0],
-        ),
+        control_low=(*(-most for most in perturbation), -STEEPEST, SPEED_RANGE[0]),
         control_high=(*perturbation, STEEPEST, SPEED_RANGE[1]),
     )

@@ -23,13 +23,7 @@ HOLD, RAMP = (1.0, 3.0), 0.5
 
 
 def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
-    """S1: one friction level from a range, no wind.
-
-    Args:
-        key: consumed.
-        steps: length.
-        friction: range [-].
-    """
+    """S1: one friction level from a range, no wind."""
     level = _within(friction, key)
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
 
@@ -62,13 +56,7 @@ def wet_road(
 
 
 def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
-    """S3: the next of the levels A, B, C, B, A, … every period, wind side random.
-
-    Args:
-        key: consumed.
-        steps: length.
-        dt: sampling period [s].
-    """
+    """S3: the next of the levels A, B, C, B, A, … every period, wind side random."""
     # One visit more, for the rest of a period at the end.
     visits = int(steps * dt / SWITCH_PERIOD) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
@@ -99,21 +87,8 @@ def random_side_forces(
     return largest * jnp.repeat(levels, each)[:steps]
 
 
-def gusts(
-    key: Key,
-    *,
-    steps: int,
-    dt: float,
-    peak: float,
-) -> Float[Array, " time"]:
-    """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s].
-
-    Args:
-        key: consumed.
-        steps: length.
-        dt: sampling period [s].
-        peak: [m/s].
-    """
+def gusts(key: Key, *, steps: int, dt: float, peak: float) -> Float[Array, " time"]:
+    """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s]."""
     level_key, hold_key = jax.random.split(key)
     # Enough for the shortest holds; what is beyond the end is not used.
     count = int(steps * dt / HOLD[0]) + 2
@@ -135,12 +110,6 @@ def held_road(
     """One constant environment from the box E.
 
     Each entry is uniform in its range or, with probability 1/3, at one of its ends.
-
-    Args:
-        key: consumed.
-        steps: length.
-        low: lower corner of E.
-        high: upper corner of E.
     """
     return jnp.tile(_from_box(key, low, high), (steps, 1))
 

@@ -113,14 +113,10 @@ def double_lane_change(key: Key, length: float) -> Path:
 
 
 def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) -> Path:
-    """Integrate κ(s) to a path that starts at the origin along x.
-
-    Uses the trapezoid rule for yaw and the midpoint rule for positions.
-    """
+    """Integrate κ(s) to a path that starts at the origin along x."""
     yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
     yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
-    # The chord of an arc points along the yaw of its middle.
-    # The midpoint rule: errors of O(h³) per sample instead of O(h²).
+    # The chord of an arc points along the yaw of its middle: errors of O(h³) a sample.
     middle = yaw[:-1] + 0.5 * yaw_steps
     x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(middle))]) * spacing
     y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(middle))]) * spacing
@@ -141,10 +137,6 @@ def path_through(
         spacing: between samples [m].
         closed: whether the last position leads back to the first, which need not be
             repeated. The path is then a `Lap`.
-
-    Raises:
-        ValueError: a path too short for its spacing, positions that are not finite, or
-            two consecutive positions that coincide.
     """
     if closed and bool(jnp.any(points[0] != points[-1])):
         points = jnp.concatenate([points, points[:1]])

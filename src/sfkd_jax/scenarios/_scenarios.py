@@ -93,9 +93,6 @@ def scenario(
         state_size: of the vehicle; the episode starts on the path at `speed`, other
             body states zero.
         dt: sampling period [s].
-
-    Raises:
-        ValueError: unknown name.
     """
     if name not in ROADS:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
@@ -124,22 +121,14 @@ def family(
     speed: float,
     state_size: int,
 ) -> Family:
-    """Combine a schedule of conditions and a family of paths.
-
-    Args:
-        conditions: key -> e_0 … e_{T-1}.
-        paths: key -> path from the origin along x.
-        speed: to hold [m/s].
-        state_size: of the vehicle.
-    """
+    """Combine a schedule of conditions and paths from the origin along x."""
 
     def sample(key: Key) -> Scenario:
         # A key each: other conditions leave the path of an episode as it is.
         path_key, condition_key = jax.random.split(key)
         start = jnp.zeros(state_size).at[3].set(speed)
         envs = conditions(condition_key)
-        # The controller observes the truth here;
-        # a measurement error replaces this field.
+        # The controller observes the truth; a measurement error replaces this field.
         return Scenario(start, envs, envs, paths(path_key), jnp.asarray(speed))
 
     return sample

@@ -19,8 +19,7 @@ from sfkd_jax.store import one_line, print_message
 class Checkpoints:
     """A directory that holds the latest and the best training state.
 
-    A save is atomic: a process killed in the middle leaves the previous states, and an
-    incomplete one is removed when the directory is opened again.
+    A save is atomic: a process killed in the middle leaves the previous states.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -45,11 +44,7 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(directory.resolve(), options=options)
 
     def save(self, step: int, state: Any, validation_loss: float) -> None:
-        """Write the state after `step` optimiser steps.
-
-        Raises:
-            OSError: it cannot be written; the previous states remain.
-        """
+        """Write the state after `step` optimiser steps, or raise an OSError."""
         metrics = {"validation_loss": float(validation_loss)}
         logger = logging.getLogger("absl")
         level = logger.level
@@ -77,10 +72,7 @@ class Checkpoints:
     def resume(self, like: Any) -> Any:
         """Return the newest readable state, or `like` if there is no state.
 
-        A damaged state is reported on stderr.
-
-        Raises:
-            OSError: there are states, and none can be read.
+        A damaged one is reported on stderr; an OSError says that all of them are.
         """
         # From the newest on: a damaged state costs the steps since the one before.
         steps = sorted(self._manager.all_steps(), reverse=True)

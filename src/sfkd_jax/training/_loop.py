@@ -166,11 +166,7 @@ def _claim(
     first_loss: Callable[[], float],
     latest: int | None,
 ) -> None:
-    """Record a training beside its checkpoints, or compare it with the recorded one.
-
-    Raises:
-        ValueError: the checkpoints are those of another one.
-    """
+    """Record a training beside its checkpoints, or refuse those of another one."""
     path, loss = directory / RECORD, "loss before the first step"
     if latest is None:
         # As text: it may be no number that JSON knows.
@@ -232,8 +228,7 @@ def _chunk(
         state: TrainState, data: Trajectory, key: Key
     ) -> tuple[TrainState, dict[str, jax.Array]]:
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
-            # From the step, not from a carried key:
-            # a resumed run draws the same batches.
+            # From the step, not a carried key: a resumed run draws the same batches.
             batch = draw(data, jax.random.fold_in(key, state.step))
             (total, parts), grads = gradient(state.params, batch)
             updates, memory = transform.update(grads, state.optimizer, state.params)

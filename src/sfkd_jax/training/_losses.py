@@ -13,15 +13,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
 from sfkd_jax.rollout import defects, rollout, state_errors
-from sfkd_jax.types import (
-    BODY,
-    Environment,
-    Model,
-    Params,
-    Scalar,
-    Space,
-    Trajectory,
-)
+from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
 
 Parts: TypeAlias = dict[str, Scalar]
 Evaluated: TypeAlias = tuple[Scalar, Parts, Float[Array, " window"]]
@@ -113,10 +105,6 @@ def multi_step_loss(
 
     Returns:
         The loss; with `tube` one of its parts is the first radius.
-
-    Raises:
-        ValueError: a tube for a model without a rate, or with more entries than the
-            body state.
     """
     known: Any = model.structure
     # The infinite-horizon radius divides by 1 − α, so α must be known in training.
