@@ -154,39 +154,6 @@ def certified(name="sfkd", scale=1.0):
     )
 
 
-def steepest_pattern(weights, starts=6):
-    """Largest ||W_L D … D W_1||_2 reached by flipping slopes between 0 and 1: a lower
-    bound of the Lipschitz constant.
-    """
-    random, best = np.random.default_rng(0), 0.0
-    for start in range(starts):
-        slopes = [
-            np.ones(len(w))
-            if start == 0
-            else random.integers(0, 2, len(w)).astype(float)
-            for w in weights[:-1]
-        ]
-
-        def gain(slopes):
-            chained = weights[0]
-            for slope, weight in zip(slopes, weights[1:], strict=True):
-                chained = weight @ (slope[:, None] * chained)
-            return np.linalg.norm(chained, 2)
-
-        now, improved = gain(slopes), True
-        while improved:
-            improved = False
-            for slope in slopes:
-                for i in range(len(slope)):
-                    slope[i] = 1 - slope[i]
-                    after = gain(slopes)
-                    improved |= after > now * (1 + 1e-12)
-                    slope[i] = slope[i] if after > now * (1 + 1e-12) else 1 - slope[i]
-                    now = max(now, after)
-        best = max(best, now)
-    return best
-
-
 def drive(plant, initial, controls, envs):
     """The plant's own trajectory, x_{k+1} = step(x_k, u_k, e_k), without any model."""
 

@@ -59,24 +59,6 @@ def gentle(steps=STEPS, seed=3):
     )
 
 
-@pytest.mark.parametrize("name", ["kinematic", "dynamic"])
-def test_it_steps_the_plant_and_nothing_else(name):
-    plant = getattr(plants, name)()
-    start, after = driven(gentle(), name)
-    moments, road = after.pipeline_state, start.info["road"]
-    states = jnp.concatenate([start.pipeline_state.state[None], moments.state])
-    low, high = np.asarray(plant.control_low), np.asarray(plant.control_high)
-    np.testing.assert_allclose(
-        moments.control, low + (high - low) * (np.asarray(gentle()) + 1) / 2, atol=1e-6
-    )
-    expected = jit(jax.vmap(plant.step))(
-        states[:-1], moments.control, road.envs[:STEPS]
-    )
-    np.testing.assert_allclose(states[1:], expected, atol=2e-5)
-    assert start.obs.shape == (env(name).observation_size,)
-    assert env(name).action_size == 2
-
-
 def test_a_controller_drives_it_as_the_test_track_has_it_driven():
     """The controls of a simulated episode, as actions: the same motion, and the same
     questions to the controller.

@@ -9,7 +9,7 @@ import pytest
 from helpers import any_law, tiny
 
 from sfkd_jax import build, control, plants
-from sfkd_jax.geometry import compose, curvature_ahead, path_coordinates
+from sfkd_jax.geometry import curvature_ahead, path_coordinates
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()
@@ -51,17 +51,6 @@ def test_the_curvature_of_every_step_is_seen_ahead():
     reference, _ = bend()
     middles = 30.0 + 0.9 * (np.arange(20) + 0.5)
     np.testing.assert_allclose(curvature_ahead(reference), 1e-4 * middles, atol=2e-5)
-
-
-def test_an_observation_is_projected_on_the_circle_that_it_drives_along():
-    reference, path = bend(0.0)
-    curvature = jnp.asarray(0.02)
-    back = jnp.asarray([-np.sin(0.018) / 0.02, (1 - np.cos(0.018)) / 0.02, -0.018])
-    foot = compose(reference[0, :3], back)
-    pose = compose(foot, jnp.asarray([0.0, 0.3, -0.1]))
-    xi = path_coordinates(jnp.append(pose, 8.5), reference[0], curvature)
-    np.testing.assert_allclose(xi, (0.3, -0.1, 8.5), atol=1e-4)
-    assert path.points.shape[1] == 4
 
 
 def test_without_samples_the_law_alone_drives():

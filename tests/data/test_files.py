@@ -276,11 +276,6 @@ WRONG = {
         ", line 9: yaw is nan; dataset.missing=drop leaves such rows out",
     ),
     "infinite": (change("steering", 100, np.inf), ", line 102: steering is inf"),
-    "time back": (
-        change("t", 50, 4.8),
-        ", line 52: t goes back from 4.9 to 4.8; two runs in one file? dataset.columns.run",
-    ),
-    "time twice": (change("t", 50, 4.9), ", line 52: t repeats 4.9"),
     "degrees": (
         scale("yaw", np.rad2deg),
         ", lines 2 to 302: yaw and the direction of travel differ; yaw is probably in degrees",
@@ -299,10 +294,7 @@ WRONG = {
         lambda c: c.update(p_x=100 * c["p_x"], p_y=100 * c["p_y"]),
         "positions are probably in cm",
     ),
-    "unsigned": (
-        unsigned,
-        "the robot moves against the sign of v (14",
-    ),
+    "unsigned": (unsigned, "the robot moves against the sign of v (14"),
     "late positions": (
         late(("p_x", "p_y"), 3),
         "the lag of p_x, p_y behind v is 0.3 s (3 steps of vehicle.dt)",
@@ -323,8 +315,6 @@ WRONG = {
     "p_x and p_y": (swap("p_x", "p_y"), "or p_x and p_y changed places"),
     "p_x and v": (swap("p_x", "v"), "wrong units, or columns changed places?"),
     "standing": (scale("v", np.zeros_like), "v stands still while the position moves"),
-    "position jumps": (jump, ", line 103: p_x, p_y jump 3.46 m at 5.66 m/s"),
-    "yaw jumps": (change("yaw", 100, 3.5), ", line 102: yaw jumps by"),
     "stale": (
         stale,
         ", line 3: the position of the row before at 5.07 m/s (270 rows like this)",
@@ -348,10 +338,6 @@ WRONG = {
     "missing": (
         lambda c: c.pop("yaw"),
         "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it with dataset.columns.state",
-    ),
-    "missing e": (
-        lambda c: c.pop("wind"),
-        "no column wind among t, p_x, p_y, yaw, v, steering, acceleration, friction; map it with dataset.columns.environment, or pass environment.source=none",
     ),
 }
 

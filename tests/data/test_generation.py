@@ -31,15 +31,13 @@ def test_every_state_is_the_plants_step_from_the_one_before(data):
     np.testing.assert_allclose(data.states[:, 1:], expected, rtol=0, atol=2e-5)
 
 
-def test_controls_respect_the_actuators_and_excite_both_channels(data):
+def test_controls_respect_the_actuators_quietly_and_violently(data):
     plant = plants.kinematic()
     assert np.all(data.controls >= np.float32(plant.control_low))
     assert np.all(data.controls <= np.float32(plant.control_high))
     spread = data.controls.std(axis=1)
-    assert np.all(spread.min(axis=0) > 1e-3)
-    assert np.all(
-        np.quantile(spread, 0.9, axis=0) > 3 * np.quantile(spread, 0.1, axis=0)
-    )  # quiet and violent
+    quiet, violent = np.quantile(spread, [0.1, 0.9], axis=0)
+    assert np.all(violent > 3 * quiet)
 
 
 def test_the_controls_are_persistently_exciting(data):

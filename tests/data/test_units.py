@@ -6,7 +6,7 @@ from recorded import recorded_run, write_csv, write_npz
 from test_files import read
 
 from sfkd_jax.data import Columns
-from sfkd_jax.data._tables import find_column, find_unit, split_unit
+from sfkd_jax.data._tables import find_column, find_unit
 
 WITH_UNITS = {
     "t": ("t (ms)", 1e3),
@@ -90,21 +90,6 @@ def test_two_columns_that_fit_are_refused(tmp_path):
         read(write_csv(tmp_path / "a.csv", columns))
     assert find_column("x", ["x(ft)", "x"], "length").header == "x"
     assert find_column("x", ["y", "xx(m)"], "length") is None
-
-
-@pytest.mark.parametrize(
-    ("header", "parts"),
-    [
-        ("x(m)", ("x", "m")),
-        ("speed [km/h] ", ("speed", "km/h")),
-        ("a  ( m/s^2 )", ("a", "m/s^2")),
-        ("f()", ("f", "")),
-        ("plain", ("plain", None)),
-        ("(m)", ("(m)", None)),
-    ],
-)
-def test_units_are_split_from_names(header, parts):
-    assert split_unit(header) == parts
 
 
 @pytest.mark.parametrize(
