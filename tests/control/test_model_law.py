@@ -10,7 +10,6 @@ import scipy.linalg
 from helpers import jit, straight
 
 from sfkd_jax import control, models, plants
-from sfkd_jax.control.laws._steady_turn import solve
 from sfkd_jax.geometry import path_step
 
 LAW = control.ModelLaw()
@@ -77,14 +76,3 @@ def test_the_gain_is_that_of_the_riccati_equation_and_stabilises(name):
     gain = np.linalg.solve(R + B.T @ value @ B, B.T @ value @ A)
     np.testing.assert_allclose(turn.gain[0], gain, rtol=2e-2, atol=2e-3)
     assert np.max(np.abs(np.linalg.eigvals(A - B @ np.asarray(turn.gain[0])))) < 1.0
-
-
-@pytest.mark.parametrize("size", [1, 3, 7])
-def test_elimination_solves_what_needs_pivots(size):
-    random = np.random.default_rng(size)
-    matrix, right = random.normal(size=(size, size)), random.normal(size=(size, 2))
-    matrix[0, 0] = 0.0 if size > 1 else matrix[0, 0]
-    solution = jit(solve)(
-        jnp.asarray(matrix, dtype=jnp.float32), jnp.asarray(right, dtype=jnp.float32)
-    )
-    np.testing.assert_allclose(matrix @ np.asarray(solution), right, atol=2e-4)

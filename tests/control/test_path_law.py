@@ -11,7 +11,7 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import plants, policy
-from sfkd_jax.control import derive_path_law, law_from_arrays
+from sfkd_jax.control import derive_path_law
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
@@ -74,19 +74,6 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
     for env in ((0.3, 8.0), (0.9, 0.0)):
         slope = slopes(jnp.asarray(env))
         assert np.max(np.abs(np.linalg.eigvals(np.asarray(slope, np.float64)))) < 0.92
-
-
-def test_a_law_survives_being_stored(derived):
-    law = derived[1]
-    flat = {name: np.asarray(leaf) for name, leaf in law._asdict().items()}
-    again = law_from_arrays(flat)
-    given = (
-        jnp.full(law.state.shape[-1], 0.1),
-        jnp.asarray(0.01),
-        jnp.asarray(9.0),
-        jnp.asarray([0.42, -3.0]),
-    )
-    np.testing.assert_array_equal(again(*given), law(*given))
 
 
 def test_the_law_is_linear_near_the_path_and_continuous_beyond(derived):

@@ -15,7 +15,6 @@ from helpers import jit
 
 from sfkd_jax import control
 from sfkd_jax.control import tuned
-from sfkd_jax.control.planners._planner import shift
 
 DT, HORIZON = 0.1, 12
 A = np.float32([[1.0, DT], [0.0, 1.0]])
@@ -183,13 +182,6 @@ def test_everything_a_driver_may_turn_is_data_and_compiles_nothing(search):
 
 
 # ---- time
-
-
-def test_a_plan_is_shifted_by_the_time_that_has_passed():
-    plan = jnp.asarray([[0.0], [2.0], [4.0], [8.0]])
-    expected = {0.0: [0, 2, 4, 8], 1.0: [2, 4, 8, 8], 0.5: [1, 3, 6, 8], 9.0: [8] * 4}
-    for elapsed, shifted in expected.items():
-        np.testing.assert_array_equal(shift(plan, jnp.asarray(elapsed))[:, 0], shifted)
 
 
 def test_a_late_call_continues_the_plan_from_where_it_would_be_by_then():
