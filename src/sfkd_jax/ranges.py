@@ -83,15 +83,7 @@ def _intervals(hint: Any) -> Iterator[Interval]:
 
 
 def imported(name: str, setting: str) -> Any:
-    """Import and return "package.module:name".
-
-    Args:
-        name: of the object.
-        setting: that names it, for the message.
-
-    Raises:
-        ValueError: there is no such module or name.
-    """
+    """Import and return "package.module:name"; the message names the setting."""
     module, _, attribute = name.partition(":")
     try:
         return getattr(import_module(module), attribute)

@@ -96,11 +96,8 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Any]:
 def parse(kind: type[T], values: Values | T, above: str = "") -> T:
     """Return plain values as an object of a dataclass, with lists as tuples.
 
-    Args:
-        kind: dataclass of the settings; its `kind_of`, if there is one, returns the
-            subclass that fits the values.
-        values: plain values, or an object of `kind`, which is returned.
-        above: name of the group with a dot, for messages.
+    An object of `kind` is returned as it is; `kind_of`, if a dataclass has it, returns
+    the subclass that fits the values. `above` is the group with a dot, for messages.
     """
     if isinstance(values, kind):
         return values

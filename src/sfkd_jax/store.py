@@ -203,7 +203,7 @@ def write_arrays(
         path: of the file, ending in .safetensors.
         arrays: numbers or truth values, by name; nothing else has a portable form.
         kind: of artefact, such as "policy".
-        config: settings that the arrays were made with.
+        config: that the arrays were made with.
         made_from: hashes of the artefacts that they were made from.
     """
     if path.suffix != SUFFIX:

@@ -217,9 +217,6 @@ def collect(
         env_high: upper corner of the box.
         excitation: σ, spread of the controls relative to half their range.
         memory: ϱ.
-
-    Returns:
-        A batch of trajectories, states (trajectory, steps + 1, state).
     """
     if not len(env_low) == len(env_high) == len(plant.parameters):
         raise ValueError(

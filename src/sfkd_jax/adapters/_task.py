@@ -209,12 +209,6 @@ class DrivingTask:
         kept: Moment = jax.tree.map(
             lambda new, old: jnp.where(sound, new, old), reached, moment
         )
-        return kept, self._transition(road, moment, kept, sound)
-
-    def _transition(
-        self, road: Scenario, before: Moment, kept: Moment, sound: Bool[Array, ""]
-    ) -> Transition:
-        """Reward, end and measures of a step."""
         # Facing backwards is leaving too: the other errors would not show it.
         backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
         left = ~sound | (jnp.abs(kept.lateral) > self.lane) | backwards
@@ -222,7 +216,7 @@ class DrivingTask:
         over = kept.progress >= road.path.length
         ended = (kept.count >= road.envs.shape[0]) | over
         missed = kept.state[3] - road.speed
-        turned = (kept.control[0] - before.control[0]) / self.plant.dt
+        turned = (kept.control[0] - moment.control[0]) / plant.dt
         cost = (
             self.lateral * kept.lateral**2
             + self.speed * missed**2
@@ -232,7 +226,7 @@ class DrivingTask:
         measures = dict(zip(MEASURES, values, strict=True))
         reward = -cost - self.leaving * left
         # Leaving at the last step is a failure, no end in time.
-        return Transition(reward, left, ~left & ended, measures)
+        return kept, Transition(reward, left, ~left & ended, measures)
 
     def situation(
         self, road: Scenario, moment: Moment

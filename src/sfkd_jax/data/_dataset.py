@@ -78,14 +78,7 @@ def split(
     """Split a batch at random into training, validation, calibration and test.
 
     An empty part, numbers that are not finite and an environment outside E are refused.
-
-    Args:
-        trajectories: a batch.
-        key: consumed.
-        shares: of the four parts, positive and of sum 1.
-        env_low: lower corner of E.
-        env_high: upper corner of E.
-        scenarios: index into `SCENARIOS` of every trajectory, or None.
+    `scenarios` are indices into `SCENARIOS`, one of every trajectory.
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
@@ -218,11 +211,6 @@ def assign_parts(
     no run. Parts made of stretches are neighbours in time, and what is measured on them
     holds for more of the same runs, not for new ones.
 
-    Args:
-        runs: number of the run of every segment.
-        shares: of the parts.
-        seed: of the random order of runs.
-
     Returns:
         The part of every segment, in the order of `PARTS`, and whether every run is in
         one part only.
@@ -344,14 +332,7 @@ def to_path(
 
     Each state is projected onto the path by Newton steps from the foot point of the
     state before, the first one from the nearest sample of the path. κ_k is the turn of
-    the path between two foot points over their distance.
-
-    Args:
-        driven: states (T + 1, state) in the world, the controls that were applied,
-            environments.
-        path: that the run followed.
-        law: (ξ, κ, v_ref, e) -> u, not clipped.
-        speeds: v_ref [m/s], (T,).
+    the path between two foot points over their distance. `speeds` are v_ref [m/s].
     """
     states = driven.states
 

@@ -40,7 +40,6 @@ Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
 empty: Any = partial(field, default_factory=dict)
 _BOX = ("env_low", "env_high")
-Segments = Annotated[int, Interval("[4, inf)")]
 
 
 @takes(sensor=schema("Sensor", object, evaluation.observed_environment, skip=("dt",)))
@@ -96,15 +95,12 @@ class DatasetSettings:
 class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
-    segments: Segments = 8000
-
 
 @takes(data.generate_along_path, skip=("held_out", *_BOX), law=LawSettings)
 class AlongPathSettings(DatasetSettings):
     """Simulated data in path coordinates, around a law."""
 
     law: LawSettings
-    segments: Segments = 8000
 
 
 @takes(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sfkd_jax.plants._vehicle import (
     CONTROL_HIGH,
@@ -16,7 +15,7 @@ from sfkd_jax.plants._vehicle import (
     side_force,
 )
 from sfkd_jax.ranges import Positive, Real
-from sfkd_jax.types import Control, Environment, State, Step
+from sfkd_jax.types import Control, Environment, Scalar, State, Step
 
 BRAKING_SHARE = 0.95  # of μ g, so that the tyres keep some lateral grip
 
@@ -141,9 +140,7 @@ def dynamic(
     )
 
 
-def _acceleration(
-    control: Control, speed: Float[Array, ""], grip: Float[Array, ""]
-) -> Float[Array, ""]:
+def _acceleration(control: Control, speed: Scalar, grip: Scalar) -> Scalar:
     """a_x [m/s²]: the commanded one within the grip; braking fades at standstill."""
     # tanh instead of a clip: a planner has a gradient beyond the limit of grip.
     drive = BRAKING_SHARE * grip * jnp.tanh(control[1] / (BRAKING_SHARE * grip))
@@ -151,16 +148,14 @@ def _acceleration(
     return jnp.maximum(drive, 0.0) + jnp.minimum(drive, 0.0) * jnp.tanh(speed / 0.2)
 
 
-def _rolling(speed: Float[Array, ""], creep_speed: float) -> Float[Array, ""]:
+def _rolling(speed: Scalar, creep_speed: float) -> Scalar:
     """Share of the wind that moves the car: 0 at standstill, 1 above creep_speed."""
     share = jnp.clip(jnp.abs(speed) / creep_speed, 0.0, 1.0)
     # Smoothstep: its slope is 0 at both ends, so that the wind fades without a kink.
     return share**2 * (3.0 - 2.0 * share)
 
 
-def _slip(
-    along: Float[Array, ""], across: Float[Array, ""], creep_speed: float
-) -> Float[Array, ""]:
+def _slip(along: Scalar, across: Scalar, creep_speed: float) -> Scalar:
     """Tangent of the slip angle, v_across / |v_along|.
 
     Below v_0, |v| becomes (v² + v_0²)/(2 v_0) ≥ v_0/2, continuously differentiable.
@@ -171,9 +166,7 @@ def _slip(
     return across / ((below**2 + creep_speed**2) / (2.0 * creep_speed) + beyond)
 
 
-def _brush(
-    slip: Float[Array, ""], stiffness: float, limit: Float[Array, ""]
-) -> Float[Array, ""]:
+def _brush(slip: Scalar, stiffness: float, limit: Scalar) -> Scalar:
     """Side force of a brush (Fiala) tyre, −F_max (3θ − 3θ|θ| + θ³).
 
     θ = C t / (3 F_max), clipped to [-1, 1].

@@ -6,7 +6,6 @@ import functools
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sfkd_jax.plants._vehicle import (
     CONTROL_HIGH,
@@ -19,10 +18,10 @@ from sfkd_jax.plants._vehicle import (
     side_force,
 )
 from sfkd_jax.ranges import Positive, Real
-from sfkd_jax.types import Control, Environment, State
+from sfkd_jax.types import Control, Environment, Scalar, State
 
 
-def _tanhc(x: Float[Array, ""]) -> Float[Array, ""]:
+def _tanhc(x: Scalar) -> Scalar:
     """tanh(x) / x for x ≥ 0, finite at 0 with its gradient."""
     # Below 1e-3 the next term, x⁴, is under what float32 resolves beside 1.
     small = x < 1e-3

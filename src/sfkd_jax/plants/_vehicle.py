@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import PathFeedback, closed_loop
 from sfkd_jax.rollout import runge_kutta
-from sfkd_jax.types import Control, Environment, State, Step
+from sfkd_jax.types import Control, Environment, Scalar, State, Step
 
 GRAVITY = 9.81  # m/s²
 CONTROL_LOW, CONTROL_HIGH = (-0.5, -6.0), (0.5, 3.0)
@@ -58,15 +57,13 @@ class Vehicle(NamedTuple):
     derivative: Step | None = None
 
 
-def side_force(wind: Float[Array, ""], *, wind_force: float) -> Float[Array, ""]:
+def side_force(wind: Scalar, *, wind_force: float) -> Scalar:
     """Return the lateral force of a side wind on the body, F = c_w w|w| [N]."""
     # w|w|, not w²: wind from the other side pushes the other way.
     return wind_force * wind * jnp.abs(wind)
 
 
-def equivalent_wind(
-    wind: Float[Array, ""], force: Float[Array, ""], *, wind_force: float
-) -> Float[Array, ""]:
+def equivalent_wind(wind: Scalar, force: Scalar, *, wind_force: float) -> Scalar:
     """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F for a force F [N]."""
     # Forces add, winds do not: the law is a signed square.
     total = side_force(wind, wind_force=wind_force) + force
@@ -76,9 +73,7 @@ def equivalent_wind(
     )
 
 
-def resistance(
-    speed: Float[Array, ""], *, mass: float, drag: float, rolling: float
-) -> Float[Array, ""]:
+def resistance(speed: Scalar, *, mass: float, drag: float, rolling: float) -> Scalar:
     """Return the deceleration by air drag and rolling [m/s²]; 0 at rest.
 
     ρ C_d A v²/(2m) + c_rr g tanh(v / 0.2 m/s)

@@ -43,8 +43,8 @@ def wet_road(
         key: consumed.
         steps: length.
         dt: sampling period [s].
-        before: range of the friction before the drop [-].
-        after: range of the friction after it [-].
+        before: range of the friction [-].
+        after: range of the friction after the drop [-].
         drop_time: range of its time [s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
@@ -123,16 +123,7 @@ def random_switching(
     high: Corner,
     dwell: Range = (3.0, 6.0),
 ) -> Float[Array, "time environment"]:
-    """Environments from the box E, as in `held_road`, each held for a random time.
-
-    Args:
-        key: consumed.
-        steps: length.
-        dt: sampling period [s].
-        low: lower corner of E.
-        high: upper corner of E.
-        dwell: range of the time that each is held [s].
-    """
+    """Environments from the box E, as in `held_road`, each held for a `dwell` [s]."""
     level_key, hold_key = jax.random.split(key)
     # One level more than the shortest dwells need.
     count = int(steps * dt / dwell[0]) + 2

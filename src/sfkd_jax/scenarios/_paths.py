@@ -155,7 +155,9 @@ def path_through(
     if closed:
         spacing = float(along[-1]) / (count - 1)
     s = jnp.arange(count) * spacing
-    x, y = (_around(jnp.interp(s, along, axis), closed) for axis in points.T)
+    x, y = (jnp.interp(s, along, axis) for axis in points.T)
+    if closed:  # goes on by two samples at both ends, for the differences
+        x, y = (jnp.concatenate([one[-3:-1], one, one[1:3]]) for one in (x, y))
     along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
     # Unwrapped: the curvature is its slope, which must not jump by 2π.
     yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
@@ -164,13 +166,6 @@ def path_through(
     if closed:
         return Lap(samples[2:-2], jnp.asarray(spacing))
     return Path(samples, jnp.asarray(spacing))
-
-
-def _around(samples: Array, closed: bool) -> Array:
-    """Continue a closed path by two samples at both ends, for its differences."""
-    if not closed:
-        return samples
-    return jnp.concatenate([samples[-3:-1], samples, samples[1:3]])
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:

@@ -6,7 +6,6 @@ import json
 import math
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -76,7 +75,7 @@ def fit(
         steps: optimiser steps.
         learning_rate: the largest.
         clip_norm: largest global gradient norm.
-        log_every: steps per compiled chunk and per log line.
+        log_every: steps per compiled chunk and per log line, which divides `steps`.
         save_every: steps per checkpoint, a multiple of `log_every`.
         inspect: params -> more finite numbers to log at every checkpoint, by name (what
             can be certified, for example).
@@ -86,8 +85,6 @@ def fit(
 
     Raises:
         TrainingStopped: the loss or a gradient is not finite.
-        ValueError: steps or save_every are no multiples of log_every, or `directory`
-            holds a training with another key, model, loss, data or settings.
     """
     directory = Path(directory)
     if save_every % log_every or steps % log_every:
@@ -98,8 +95,13 @@ def fit(
     # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
+
     # Compiled, since initialisers op by op take seconds for many small matrices.
-    begin = jax.jit(partial(_begin, model, transform))
+    @jax.jit
+    def begin(key: Key) -> TrainState:
+        params = model.init(key)
+        return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+
     record = {
         "key": jax.random.key_data(key).tolist(),
         "data": store.sha256_of_arrays(data._asdict()),
@@ -152,12 +154,6 @@ def fit(
     # Also after an error: the caller may open the directory again to resume.
     finally:
         checkpoints.close()
-
-
-def _begin(model: Model, transform: Any, key: Key) -> TrainState:
-    """The state before the first step."""
-    params = model.init(key)
-    return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
 
 
 def _claim(
