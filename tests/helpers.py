@@ -321,10 +321,3 @@ def put(document, path, value):
         inner = inner[int(key) if isinstance(inner, list) else key]
     inner[int(last) if isinstance(inner, list) else last] = value
     return changed
-
-
-def entry_at(document, path):
-    """The value at a dotted path."""
-    for key in path.split("."):
-        document = document[int(key) if isinstance(document, list) else key]
-    return document

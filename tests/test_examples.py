@@ -31,10 +31,7 @@ QUICK = {
 LONG = {
     "cartpole": ({"samples": 256}, lambda upright: upright > 0.95),
     # Distance [m] from the window, depth [m] in its frame.
-    "quadrotor_window": (
-        {"samples": 512},
-        lambda end: end[0] < 0.3 and end[1] <= 1e-5,
-    ),
+    "quadrotor_window": ({"samples": 512}, lambda end: end[0] < 0.3 and end[1] <= 1e-5),
     # Distance left [m], smallest gap [m].
     "fleet": (
         {"count": 16, "samples": 128},
@@ -172,8 +169,7 @@ def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_bl
     assert node.sent == []
     odometry, path = Message(), Message()
     odometry.pose.pose = Message(
-        position=Message(x=0.0, y=0.3),
-        orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0),
+        position=Message(x=0.0, y=0.3), orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0)
     )
     odometry.twist.twist = Message(
         linear=Message(x=10.0, y=0.0), angular=Message(z=0.0)

@@ -11,11 +11,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law
 
 from sfkd_jax import plants
-from sfkd_jax.data import (
-    check_on_path,
-    generate_along_path,
-    to_path,
-)
+from sfkd_jax.data import check_on_path, generate_along_path, to_path
 from sfkd_jax.scenarios import path_from_curvature
 from sfkd_jax.types import BODY, POSE, Trajectory
 
