@@ -192,7 +192,7 @@ def save(
         path: of the file.
         params: weights.
         settings: that they were made with.
-        made_from: hashes of the artefacts that they were made from.
+        made_from: hashes of artefacts, by kind.
         law: that a model in path coordinates was learned around, or None.
     """
     # Beside the weights: the hash that certificates refer to then covers the law.

@@ -199,12 +199,8 @@ def write_arrays(
     `sha256` in the manifest identifies the arrays and `content_sha256` the arrays and
     all settings, independent of order and layout; other documents refer to them.
 
-    Args:
-        path: of the file, ending in .safetensors.
-        arrays: numbers or truth values, by name; nothing else has a portable form.
-        kind: of artefact, such as "policy".
-        config: that the arrays were made with.
-        made_from: hashes of the artefacts that they were made from.
+    Numbers and truth values alone have a portable form. `config` are the settings that
+    the arrays were made with, `made_from` the hashes of artefacts.
     """
     if path.suffix != SUFFIX:
         raise failure(path, f"not written, the name must end in {SUFFIX}")

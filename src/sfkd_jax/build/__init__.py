@@ -182,10 +182,7 @@ def check_consistent(
 ) -> None:
     """Raise a ValueError if settings of a policy contradict each other or its law.
 
-    Args:
-        settings: of the policy.
-        vehicle: of the settings.
-        law: tables of a policy along a path, as numpy arrays, or None.
+    The law is that of a policy along a path, as tables of numpy.
     """
     space, data = settings["space"], settings.get("dataset", {})
     for name, values in space.items():
@@ -238,10 +235,7 @@ def _check_law(
 
 def space_to_settings(space: Space) -> dict[str, list[float]]:
     """Return scales as plain lists, for a manifest."""
-    return {
-        name: [float(entry) for entry in value]
-        for name, value in space._asdict().items()
-    }
+    return {name: scale.tolist() for name, scale in space._asdict().items()}
 
 
 def space_from_settings(settings: Values) -> Space:
@@ -276,14 +270,9 @@ def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
 
 
 class System(NamedTuple):
-    """A system that is evaluated: a row of a table.
+    """A system that is evaluated, a row of a table; `env_source` is of `ENV_SOURCES`.
 
-    Attributes:
-        model: that the controller predicts with.
-        params: of the model.
-        env_source: one of `ENV_SOURCES`.
-        certificate: verified, or None.
-        law: that a model in path coordinates was learned around, or None.
+    The certificate is verified; a model in path coordinates was learned around the law.
     """
 
     model: Model

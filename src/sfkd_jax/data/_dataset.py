@@ -376,11 +376,8 @@ def coverage(
 ) -> dict[str, dict[str, float]]:
     """Return range, middle 99.8 % and the share of visited bins of every channel.
 
-    A bin is a tenth of the range; it is visited if it holds 0.1 % of the samples.
-
-    Returns:
-        name -> {"low", "high", "low_998", "high_998", "bins_visited"}; a constant
-        channel visits no bin.
+    A bin is a tenth of the range; it is visited if it holds 0.1 % of the samples. A
+    constant channel visits none.
     """
     covered = {}
     for name, samples in values.items():

@@ -62,9 +62,7 @@ class Log:
         rows: position of each row in the file.
         row_name: what `rows` counts, "line" or "row".
         time: [s].
-        states: one row per moment.
-        controls: one row per moment.
-        envs: one row per moment; zeros where nobody measured them.
+        envs: zeros where nobody measured them.
         stretch: number of the uninterrupted stretch that each row belongs to.
     """
 

@@ -106,12 +106,8 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """Return RK4 steps of a car that brakes cannot reverse: v ≥ 0 after every step.
 
     The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
-    a step stands: neither its position nor its yaw moves backwards.
-
-    Args:
-        derivative: dx/dt = f(x, u, e).
-        dt: sampling period [s].
-        substeps: integration steps per sampling period.
+    a step stands: neither its position nor its yaw moves backwards. The sampling period
+    dt [s] has `substeps` integration steps.
     """
     h = dt / substeps
 
@@ -139,11 +135,7 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
 def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     """Return the vehicle with a speed command instead of an acceleration.
 
-    a = clip(k_v (v_cmd − v)), held over dt.
-
-    Args:
-        vehicle: with limits, whose second control is an acceleration.
-        gain: k_v [1/s].
+    a = clip(k_v (v_cmd − v)), held over dt, with the gain k_v [1/s].
     """
     if vehicle.speed_loop or not vehicle.control_low:
         raise ValueError(

@@ -39,13 +39,7 @@ def wet_road(
 ) -> Schedule:
     """S2: friction drops abruptly once, while smooth gusts blow.
 
-    Args:
-        key: consumed.
-        steps: length.
-        dt: sampling period [s].
-        before: range of the friction [-].
-        after: range of the friction after the drop [-].
-        drop_time: range of its time [s].
+    `before` and `after` are ranges of the friction, `drop_time` that of the drop [s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
     high, low = _within(before, before_key), _within(after, after_key)
@@ -71,18 +65,13 @@ def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
 def random_side_forces(
     key: Key, *, steps: int, dt: float, largest: float | Scalar, hold: float = 1.0
 ) -> Float[Array, " time"]:
-    """Draw unmeasured side forces, uniform in [-F, F] and constant for `hold` [N].
+    """Draw unmeasured side forces up to `largest` [N], each constant for `hold` [s].
 
-    Args:
-        key: consumed; the same key gives the same forces at every F, up to the factor.
-        steps: length.
-        dt: sampling period [s].
-        largest: F [N].
-        hold: duration of a level [s].
+    The same key gives the same forces at every size, up to the factor.
     """
     # In whole steps: a force that changed within a step would not be held by it.
     each = round(hold / dt)
-    # Shares of F: the same pushes at every size.
+    # Shares of the largest: the same pushes at every size.
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
     return largest * jnp.repeat(levels, each)[:steps]
 

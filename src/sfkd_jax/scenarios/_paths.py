@@ -89,10 +89,7 @@ def double_lane_change(key: Key, length: float) -> Path:
     """Change to the lane at a random side and back, once a period (ISO 3888-1).
 
     The heading of a change over ℓ is θ sin²(π s/ℓ), whose offset is close to θ ℓ / 2.
-
-    Args:
-        key: consumed.
-        length: smallest length [m].
+    The path is at least `length` long [m].
     """
     first, middle, last = SECTIONS
     start_key, side_key = jax.random.split(key)
