@@ -17,21 +17,11 @@ ERRORS = jit(jax.vmap(control.path_errors))
 RADIUS = 40.0
 
 
-def on_circle(along, offset=0.0):
-    """Poses along a left-hand circle through the origin at `along` [m], `offset` [m] to
-    its left.
-    """
+def on_circle(along):
+    """Poses along a left-hand circle through the origin at `along` [m]."""
     yaw = along / RADIUS
-    radius = RADIUS - offset
-    return np.stack(
-        [
-            radius * np.sin(yaw),
-            RADIUS - radius * np.cos(yaw),
-            yaw,
-            np.full_like(yaw, 9.0),
-        ],
-        axis=1,
-    )
+    x, y = RADIUS * np.sin(yaw), RADIUS * (1 - np.cos(yaw))
+    return np.column_stack([x, y, yaw, np.full_like(yaw, 9.0)])
 
 
 def errors_at(states, point=(0.0, 0.0, 0.0, 9.0), curvature=1 / RADIUS):

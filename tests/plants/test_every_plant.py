@@ -9,8 +9,6 @@ from sfkd_jax.geometry import compose
 from sfkd_jax.plants import rk4, with_speed_loop
 from sfkd_jax.types import POSE
 
-ENV = (0.9, 0.0)
-
 
 @pytest.mark.usefixtures("x64")
 def test_the_error_falls_with_the_fourth_power_of_the_step(vehicle):
@@ -155,19 +153,17 @@ def test_a_car_launches_from_rest_along_the_kinematic_curve(vehicle, hold):
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("which", ["step", "nominal", "nominal_derivative"])
-@pytest.mark.parametrize(
-    ("command", "acceleration"), [(1e3, 3.0), (-1e3, -6.0), (10.4, 0.8), (9.5, -1.0)]
-)
-def test_the_loop_asks_for_what_the_actuator_can_give(
-    vehicle, which, command, acceleration
-):
-    state, env, steering = (
-        jnp.zeros(len(vehicle.state_names)).at[3].set(10.0),
-        jnp.array(ENV),
-        0.1,
+def test_the_loop_asks_for_what_the_actuator_can_give(vehicle, which, many):
+    def controls(second):
+        return jnp.stack([jnp.full(4, 0.1), jnp.asarray(second)], axis=1)
+
+    envs = jnp.tile(jnp.asarray([0.9, 0.0]), (4, 1))
+    states = jnp.zeros((4, len(vehicle.state_names))).at[:, 3].set(10.0)
+    closed, opened = (
+        many(getattr(one, which))(states, controls(asked), envs)
+        for one, asked in (
+            (with_speed_loop(vehicle, gain=2.0), [1e3, -1e3, 10.4, 9.5]),
+            (vehicle, [3.0, -6.0, 0.8, -1.0]),
+        )
     )
-    closed = getattr(with_speed_loop(vehicle, gain=2.0), which)(
-        state, jnp.array([steering, command]), env
-    )
-    opened = getattr(vehicle, which)(state, jnp.array([steering, acceleration]), env)
     np.testing.assert_allclose(closed, opened, rtol=0, atol=1e-12)
