@@ -25,6 +25,7 @@ from sfkd_jax.data._tables import DROP
 
 Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
 """Lowest and highest of every channel, or None where there is no bound."""
+Jumps: TypeAlias = tuple[Bool[np.ndarray, " step"], Callable[[int], str]]
 SHORTEST = 3
 """Rows that a run needs to be checked at all."""
 SLOWER = 1.2
@@ -325,9 +326,7 @@ class Checks:
         # Tyres that slip make yaw look early.
         return Delay(lag, float(alike), certain=lag > 5.0 * spread)
 
-    def _position_jumps(
-        self, log: Log
-    ) -> tuple[Bool[np.ndarray, " step"], Callable[[int], str]]:
+    def _position_jumps(self, log: Log) -> Jumps:
         """Steps much longer than the speed explains."""
         excess = log.moved - log.integrated
         # By the median: the jumps themselves must not widen what is usual.
@@ -341,9 +340,7 @@ class Checks:
             ),
         )
 
-    def _yaw_jumps(
-        self, log: Log
-    ) -> tuple[Bool[np.ndarray, " step"], Callable[[int], str]]:
+    def _yaw_jumps(self, log: Log) -> Jumps:
         """Steps that turn much more than the others, between rows near in time."""
         turned = np.abs(np.diff(np.unwrap(log.states[:, 2])))
         # Small robots turn fast: only what stands out of their own turns is a jump.

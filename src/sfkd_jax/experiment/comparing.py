@@ -196,13 +196,7 @@ def _row_file(path: Path) -> Path:
 
 
 class Comparison:
-    """The rows of one table on their scenarios.
-
-    Attributes:
-        directory: of its cells and its page.
-        cells: of all rows.
-        failed: why a row failed, by its name.
-    """
+    """The rows of one table on their scenarios; `failed` says why a row has none."""
 
     def __init__(self, settings: Settings) -> None:
         """List the cells of the comparison."""

@@ -140,12 +140,7 @@ def _policy_system(settings: Settings) -> System:
 
 
 class SystemEvaluation:
-    """One system, compiled once for all sets of episodes of one length.
-
-    Attributes:
-        controller: of the system.
-        params: of its model, folded.
-    """
+    """One system, compiled once for all sets of episodes of one length."""
 
     def __init__(
         self, settings: Settings, name: str, system: System, dataset: Dataset | None

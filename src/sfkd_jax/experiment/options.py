@@ -126,7 +126,6 @@ class TrainingSettings:
     Attributes:
         batch: windows a step.
         window: steps of a window.
-        loss: weights of `training.multi_step_loss`.
     """
 
     loss: Any
@@ -147,7 +146,6 @@ class CertificationSettings:
         renew: whether `certify` replaces a certificate of other weights.
         horizon: of the tubes [steps].
         level: of the tubes.
-        corridor: arguments of `certify_corridor`.
     """
 
     corridor: Any
