@@ -45,8 +45,10 @@ def law_alone():
 @cache
 def adaptive(**settings):
     options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW} | settings
-    adaptation = control.Adaptation(**options)
-    return control.along_reference(adaptation.controller(), coordinates=3)
+    adaptation = control.Adaptation(**options).controller()
+    about = {"model": MODEL, "law": LAW, "dt": PLANT.dt, "horizon": HORIZON}
+    gate = control.Gate(inner=adaptation, **about).controller()
+    return control.along_reference(gate, coordinates=3)
 
 
 def road(time, speed=10.0):
@@ -98,7 +100,7 @@ def driver(**settings):
             seen = jax.lax.switch(fault, list(FAULTS.values()), time, seen, last)
             action, memory, info = controller.act({}, memory, seen, env, road(time))
             state = PLANT.step(state, action.at[0].add(steering), pushed)
-            return (state, memory, seen), (info, memory.inner.belief)
+            return (state, memory, seen), (info, memory.inner.inner.belief)
 
         start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
         carry = (start, controller.init(jax.random.key(0)), start)
@@ -149,45 +151,6 @@ def test_the_certificate_of_the_model_holds_for_the_adapted_one():
     broken = exported(with_offset(model), offset._replace(params=larger))
     with pytest.raises(certification.CertificationRefused):
         certification.verify(certificate, params, model=model, weights=broken)
-
-
-def test_one_filter_is_the_textbook_kalman_filter():
-    random = np.random.default_rng(0)
-    mean, slope = random.normal(size=3), random.normal(size=(3, 3))
-    root, noise = random.normal(size=(3, 3)), np.diag([0.1, 0.2, 0.3])
-    sensors, measured = np.array([0.5, 0.1]), random.normal(size=2)
-    ahead = slope @ (root @ root.T) @ slope.T + noise
-    H = np.eye(2, 3)
-    gain = ahead @ H.T @ np.linalg.inv(H @ ahead @ H.T + np.diag(sensors))
-    expected = mean + gain @ (measured - H @ mean), (np.eye(3) - gain @ H) @ ahead
-    covariance = estimator.propagated(
-        jnp.asarray(root @ root.T)[None],
-        jnp.asarray(slope)[None],
-        jnp.asarray(noise)[None],
-    )
-    bank = estimator.Bank(jnp.asarray(mean)[None], covariance, jnp.ones(1))
-    bank, explained = estimator.corrected(
-        bank, jnp.asarray(measured), jnp.asarray(sensors)
-    )
-    assert explained
-    np.testing.assert_allclose(bank.mean(), expected[0], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(bank.covariances[0], expected[1], rtol=1e-3, atol=1e-4)
-
-
-def test_mixing_keeps_mean_and_total_variance():
-    """The laws of total expectation and variance, for any chain."""
-    random = np.random.default_rng(1)
-    roots = random.normal(size=(3, 2, 2))
-    chain = random.dirichlet(np.ones(3), size=3)
-    before = estimator.Bank(
-        jnp.asarray(random.normal(size=(3, 2))),
-        jnp.asarray(roots @ roots.transpose(0, 2, 1)),
-        jnp.asarray(random.dirichlet(np.ones(3))),
-    )
-    after = estimator.mixed(before, jnp.asarray(chain))
-    np.testing.assert_allclose(after.probabilities.sum(), 1.0, atol=1e-6)
-    np.testing.assert_allclose(after.mean(), before.mean(), atol=1e-6)
-    np.testing.assert_allclose(after.variance(), before.variance(), rtol=1e-5)
 
 
 def test_a_constant_side_force_is_found():
@@ -259,10 +222,10 @@ def acting():
 def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
     state, act = acting()
-    belief = state.inner.belief._replace(
-        scores=jnp.asarray([2.0, 1.0]), started=jnp.asarray(True)
-    )
-    state = state._replace(inner=state.inner._replace(belief=belief))
+    gate, scores = state.inner, jnp.asarray([2.0, 1.0])
+    belief = gate.inner.belief._replace(scores=scores, started=jnp.asarray(True))
+    gate = gate._replace(inner=gate.inner._replace(belief=belief))
+    state = state._replace(inner=gate)
     _, _, info = act({}, state, *INPUTS)
     assert not info["adapting"]
     np.testing.assert_array_equal(info["causes"], 0.0)
@@ -299,7 +262,7 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
     ("change", "word"),
     [
         ({"env_low": (0.3, -7.0)}, "wind"),
-        ({"patience": 0}, "patience"),
+        ({"dwell": 1.0}, "dwell"),
         ({"model": models.physics(PLANT.step)}, "path coordinates"),
     ],
 )
