@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -95,13 +96,8 @@ def fit(
     # Batches have a stream of their own: a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
-
     # Compiled, since initialisers op by op take seconds for many small matrices.
-    @jax.jit
-    def begin(key: Key) -> TrainState:
-        params = model.init(key)
-        return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
-
+    begin = jax.jit(partial(_begin, model, transform))
     record = {
         "key": jax.random.key_data(key).tolist(),
         "data": store.sha256_of_arrays(data._asdict()),
@@ -154,6 +150,12 @@ def fit(
     # Also after an error: the caller may open the directory again to resume.
     finally:
         checkpoints.close()
+
+
+def _begin(model: Model, transform: Any, key: Key) -> TrainState:
+    """The state before the first step."""
+    params = model.init(key)
+    return TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
 
 
 def _claim(
