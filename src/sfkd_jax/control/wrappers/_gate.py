@@ -47,6 +47,8 @@ Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 """Lower and upper limits."""
 MOVING = 0.3
 """Speed [m/s] above which a repeated observation is that of a sensor that froze."""
+PATIENCE_AHEAD = 6.0
+"""Longest time without an observation from another place of the path [s]."""
 SLOWING = 0.8
 """Speed [m/s] by which a lost vehicle's reference is below its speed: braking."""
 
@@ -92,6 +94,7 @@ class GateState(NamedTuple):
         modelled: whether the model predicted it, inside the conditions.
         along: distance along the path of the last measured position, see `Preview`.
         missing: number of steps since a coordinate was last used.
+        skew: what a wrong pose adds to the relative yaw [rad]; 0 for a right one.
         doubt: number of steps until the certificate may be claimed again, after a
             measurement was believed that nothing explains.
         env: the last finite environment.
@@ -105,6 +108,7 @@ class GateState(NamedTuple):
     modelled: Bool[Array, ""]
     along: Scalar
     missing: Int[Array, " coordinate"]
+    skew: Scalar
     doubt: Int[Array, ""]
     env: Environment
     road: Float[Array, "preview 2"]
@@ -120,7 +124,8 @@ class Gate:
 
     A coordinate that does not pass, is not finite, or belongs to an observation that
     repeats the last one bit for bit while the vehicle moves, is replaced by ξ⁻: the
-    vehicle drives on its nominal model, with the other coordinates measured. After
+    vehicle drives on its nominal model, with the other coordinates measured; of the yaw
+    of a wrong pose the changes are. After
     `patience` a finite measurement is believed, whatever it says, and the certificate
     is not claimed for a `trial`; without one the reference speed falls, and the vehicle
     stops. Outside the conditions ξ⁻ is a point that keeps its heading and speed, and
@@ -162,9 +167,9 @@ class Gate:
     test: InnovationTest | None = None
     patience: Positive = 2.0
     trial: Positive = 10.0
-    share: Positive = 0.6
+    share: Positive = 0.55
     gain: Fraction = 0.8
-    growth: Positive = 0.05
+    growth: Positive = 0.02
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -184,6 +189,7 @@ class Gate:
             modelled=jnp.asarray(False),
             along=jnp.full((), jnp.nan),
             missing=jnp.zeros(size, jnp.int32),
+            skew=jnp.zeros(()),
             doubt=jnp.zeros((), jnp.int32),
             env=middle,
             road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
@@ -213,6 +219,8 @@ class Gate:
         # The path goes on under the vehicle: an observation that is suddenly ahead or
         # behind is late, or of another place, in all of its entries.
         shifted = jnp.abs(preview.along - state.along) > self._reach(state, periods)
+        # Not for ever: the reference may have moved, and the car has stopped by then.
+        shifted &= jnp.max(state.missing) < round(PATIENCE_AHEAD / self.dt)
         moving = jnp.abs(expected[PATH_SPEED]) > MOVING
         stale = (preview.repeated | shifted) & moving
         usable = jnp.isfinite(coordinates) & readable & ~stale
@@ -226,13 +234,18 @@ class Gate:
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
-        tested, verdict = self._tested(state, coordinates, measured & on_time)
+        clean = jnp.all(measured)
+        tested, verdict = self._tested(state, coordinates, measured & clean & on_time)
         clear = on_time & readable & env_known
         trusted = preview.trusted & clear & (doubt == 0) & ~verdict["innovation_alarm"]
         missing = jnp.where(measured, 0, state.missing + 1)
         xi = jnp.where(measured, coordinates, expected)
+        pose_wrong = compared & ~(measured[LATERAL] & measured[HEADING])
+        skewed = pose_wrong & usable[HEADING]
+        heading, skew = _heading(state, coordinates, innovation, grown[HEADING])
+        xi = xi.at[HEADING].set(jnp.where(skewed, heading, xi[HEADING]))
         # Nothing to believe and nothing to rely on: stop.
-        lost = jnp.any(missing > round(self.patience / self.dt))
+        lost = jnp.any((missing > round(self.patience / self.dt)) & ~usable)
         slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
         road = jnp.where(lost, road.at[:, 1].set(slower), road)
 
@@ -242,11 +255,10 @@ class Gate:
         control, inner, info = self.inner.act(params, state.inner, xi, known, seen)
 
         # A believed outlier starts anew; noise is averaged.
-        estimate = expected + self.gain * innovation
-        estimate = jnp.where(measured & compared & plausible, estimate, xi)
+        estimate = expected + self.gain * _difference(xi, expected)
+        estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
         applied = Applied(control, road[0], info.get("env_estimate", known))
         ahead, modelled = self._predict(params, estimate, applied)
-        clean = jnp.all(measured)
         tested = self._expect(tested, params, xi, applied, info, clear & clean)
         report: Any = {
             **info,
@@ -263,8 +275,9 @@ class Gate:
             inner=inner,
             expected=ahead,
             modelled=modelled,
-            along=jnp.where(jnp.any(measured), preview.along, state.along),
+            along=jnp.where(clean, preview.along, state.along),
             missing=missing,
+            skew=jnp.where(skewed, skew, 0.0),
             doubt=jnp.maximum(doubt - 1, 0),
             env=known,
             road=road,
@@ -347,6 +360,20 @@ class Gate:
         inside = self.conditions.hold(xi, road) & all_finite(ahead)
         sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
         return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside
+
+
+def _heading(
+    state: GateState, xi: PathState, innovation: PathState, limit: Scalar
+) -> tuple[Scalar, Scalar]:
+    """The yaw of a wrong pose, less what is wrong with it, and that.
+
+    A yaw that is off stays off by the same angle, and so does one relative to the
+    wrong place of a bend: its changes are still measured.
+    """
+    off = innovation[HEADING]
+    follows = (state.skew != 0.0) & (jnp.abs(wrap_angle(off - state.skew)) <= limit)
+    skew = jnp.where(follows, state.skew, off)
+    return xi[HEADING] - skew, skew
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
