@@ -75,7 +75,7 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 23_750, "tests": 15_300, "benchmarks, experiments": 2_300}
+LINES = {"src": 24_700, "tests": 15_250, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
 FILES_IN_SRC = 123
 

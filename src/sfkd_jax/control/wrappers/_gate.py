@@ -115,6 +115,30 @@ class GateState(NamedTuple):
     test: InnovationState | None
 
 
+class Believed(NamedTuple):
+    """What the gate makes of one measurement.
+
+    Attributes:
+        xi: ξ, measured where it is believed.
+        measured: where it is.
+        compared: whether there was a prediction.
+        innovation: ξ − ξ⁻.
+        plausible: where the step explains it.
+        forced: whether something is believed that the step does not explain.
+        lost: whether there has been nothing to believe for too long.
+        skew: see `GateState`.
+    """
+
+    xi: PathState
+    measured: Bool[Array, " coordinate"]
+    compared: Bool[Array, ""]
+    innovation: PathState
+    plausible: Bool[Array, " coordinate"]
+    forced: Bool[Array, ""]
+    lost: Bool[Array, ""]
+    skew: Scalar
+
+
 @dataclass(frozen=True, kw_only=True)
 class Gate:
     """A controller along a path that follows plausible measurements only.
@@ -213,6 +237,62 @@ class Gate:
         periods = _elapsed(state.inner)
         on_time = jnp.abs(periods - 1.0) < 1e-3
 
+        found = self._believed(state, coordinates, preview, periods)
+        xi, measured, compared = found.xi, found.measured, found.compared
+        doubt = jnp.where(found.forced, round(self.trial / self.dt), state.doubt)
+        clean = jnp.all(measured)
+        tested, verdict = self._tested(state, coordinates, measured & clean & on_time)
+        clear = on_time & readable & env_known
+        trusted = preview.trusted & clear & (doubt == 0) & ~verdict["innovation_alarm"]
+        # Nothing to believe and nothing to rely on: stop.
+        slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
+        road = jnp.where(found.lost, road.at[:, 1].set(slower), road)
+
+        seen = preview._replace(
+            road=road, measured=measured, on_time=on_time, trusted=trusted
+        )
+        control, inner, info = self.inner.act(params, state.inner, xi, known, seen)
+
+        # A believed outlier starts anew; noise is averaged.
+        estimate = state.expected + self.gain * _difference(xi, state.expected)
+        estimate = jnp.where(compared & (found.plausible | ~measured), estimate, xi)
+        applied = Applied(control, road[0], info.get("env_estimate", known))
+        ahead, modelled = self._predict(params, estimate, applied)
+        tested = self._expect(tested, params, xi, applied, info, clear & clean)
+        report: Any = {
+            **info,
+            "healthy": info.get("healthy", True) & clean & trusted,
+            "measured": measured,
+            "dead_reckoning": compared & ~clean,
+            "innovation": jnp.where(measured, found.innovation, jnp.nan),
+            "path_state": jnp.where(measured, coordinates, jnp.nan),
+            **verdict,
+            "trusted": trusted,
+            "env_inside": info.get("env_inside", True) & env_known,
+        }
+        after = GateState(
+            inner=inner,
+            expected=ahead,
+            modelled=modelled,
+            along=jnp.where(clean, preview.along, state.along),
+            missing=jnp.where(measured, 0, state.missing + 1),
+            skew=found.skew,
+            doubt=jnp.maximum(doubt - 1, 0),
+            env=known,
+            road=road,
+            test=tested,
+        )
+        return control, after, report
+
+    def _believed(
+        self,
+        state: GateState,
+        coordinates: PathState,
+        preview: Preview,
+        periods: Scalar,
+    ) -> Believed:
+        """What of a measurement is used, and what stands for the rest."""
+        readable = all_finite(preview.road)
         expected, compared = state.expected, all_finite(state.expected)
         innovation = _difference(coordinates, expected)
         limit = self._limit(state, expected, periods)
@@ -233,57 +313,23 @@ class Gate:
         measured = usable & (plausible | late | ~compared)
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
-        doubt = jnp.where(forced, round(self.trial / self.dt), state.doubt)
-        clean = jnp.all(measured)
-        tested, verdict = self._tested(state, coordinates, measured & clean & on_time)
-        clear = on_time & readable & env_known
-        trusted = preview.trusted & clear & (doubt == 0) & ~verdict["innovation_alarm"]
         missing = jnp.where(measured, 0, state.missing + 1)
         xi = jnp.where(measured, coordinates, expected)
         pose_wrong = compared & ~(measured[LATERAL] & measured[HEADING])
         skewed = pose_wrong & usable[HEADING]
         heading, skew = _heading(state, coordinates, innovation, grown[HEADING])
         xi = xi.at[HEADING].set(jnp.where(skewed, heading, xi[HEADING]))
-        # Nothing to believe and nothing to rely on: stop.
-        lost = jnp.any((missing > round(self.patience / self.dt)) & ~usable)
-        slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
-        road = jnp.where(lost, road.at[:, 1].set(slower), road)
-
-        seen = preview._replace(
-            road=road, measured=measured, on_time=on_time, trusted=trusted
-        )
-        control, inner, info = self.inner.act(params, state.inner, xi, known, seen)
-
-        # A believed outlier starts anew; noise is averaged.
-        estimate = expected + self.gain * _difference(xi, expected)
-        estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
-        applied = Applied(control, road[0], info.get("env_estimate", known))
-        ahead, modelled = self._predict(params, estimate, applied)
-        tested = self._expect(tested, params, xi, applied, info, clear & clean)
-        report: Any = {
-            **info,
-            "healthy": info.get("healthy", True) & clean & trusted,
-            "measured": measured,
-            "dead_reckoning": compared & ~clean,
-            "innovation": jnp.where(measured, innovation, jnp.nan),
-            "path_state": jnp.where(measured, coordinates, jnp.nan),
-            **verdict,
-            "trusted": trusted,
-            "env_inside": info.get("env_inside", True) & env_known,
-        }
-        after = GateState(
-            inner=inner,
-            expected=ahead,
-            modelled=modelled,
-            along=jnp.where(clean, preview.along, state.along),
-            missing=missing,
+        lost = (missing > round(self.patience / self.dt)) & ~usable
+        return Believed(
+            xi=xi,
+            measured=measured,
+            compared=compared,
+            innovation=innovation,
+            plausible=plausible,
+            forced=forced,
+            lost=jnp.any(lost),
             skew=jnp.where(skewed, skew, 0.0),
-            doubt=jnp.maximum(doubt - 1, 0),
-            env=known,
-            road=road,
-            test=tested,
         )
-        return control, after, report
 
     def _reach(self, state: GateState, periods: Scalar) -> Scalar:
         """How far the vehicle gets in a step, and somewhat more [m]."""
