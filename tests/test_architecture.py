@@ -77,7 +77,7 @@ FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 
 LINES = {"src": 24_700, "tests": 15_250, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
-FILES_IN_SRC = 123
+FILES_IN_SRC = 126
 
 OPTIONS, EXPERIMENTS = 65, 10
 COMMITTED = {"*.json": 685_000, "figures": 2_600_000}

@@ -13,7 +13,12 @@ from networks import NETWORK, ROOT, TURNED
 
 from sfkd_jax import models
 from sfkd_jax.certification import CertificationRefused, OutputMetric
-from sfkd_jax.certification._claims import OUTPUTS, readouts, require_output_metric
+from sfkd_jax.certification._claims import (
+    OUTPUTS,
+    readouts,
+    require_output_metric,
+    size_of,
+)
 from sfkd_jax.certification._measured import Residuals, residuals
 from sfkd_jax.certification._metrics import accepted_metric, propose_metric
 from sfkd_jax.certification._tubes import radii, worst_gaps
@@ -21,9 +26,11 @@ from sfkd_jax.certification._weights import exported
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Declared, Polytope, Trajectory
 
-JOINT = [[np.full(4, 1.2 + 0.1 * k)] for k in range(3)]
+UNIT = size_of(ROOT @ ROOT)
+METRIC = ROOT @ ROOT / UNIT
+JOINT = [[np.full(4, (1.2 + 0.1 * k) / UNIT)] for k in range(3)]
 HONEST = {
-    name: accepted_metric(TURNED, readouts(TURNED)[name], ROOT @ ROOT, JOINT)
+    name: accepted_metric(TURNED, readouts(TURNED)[name], METRIC, JOINT)
     for name in OUTPUTS
 }
 every_output = pytest.mark.parametrize("name", HONEST)
@@ -50,7 +57,7 @@ def test_what_was_found_is_proved_also_from_json(name):
 def test_the_constants_are_those_of_the_matrices(name):
     """|c|_{P⁻¹} of the row, and nothing smaller than what was found."""
     claim, row = HONEST[name], readouts(TURNED)[name][0]
-    gain = np.sqrt(row @ np.linalg.solve(ROOT @ ROOT, row))
+    gain = np.sqrt(row @ np.linalg.solve(METRIC, row))
     assert claim.lipschitz == pytest.approx(gain, rel=1e-5)
     for constant in ("alpha", "lipschitz"):
         value = getattr(claim, constant)

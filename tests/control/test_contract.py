@@ -123,7 +123,15 @@ def shielded():
         control=(LIMITS["control_low"], LIMITS["control_high"]),
         conditions=control.Conditions(env=(BOX["env_low"], BOX["env_high"])),
     )
-    return along(shield.controller()), params
+    gate = control.Gate(
+        inner=shield.controller(),
+        model=model,
+        law=law,
+        dt=PLANT.dt,
+        horizon=HORIZON,
+        conditions=shield.conditions,
+    )
+    return along(gate.controller()), params
 
 
 def adaptive():
@@ -262,7 +270,9 @@ def test_controls_are_finite_and_within_the_limits_whatever_is_seen(name):
 def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recovers(name):
     _, info = drive(name)
     healthy = np.asarray(info["healthy"])[:9]
-    assert set(np.flatnonzero(~healthy)) == set(BLACKOUTS.values())
+    unhealthy, blackouts = set(np.flatnonzero(~healthy)), set(BLACKOUTS.values())
+    # A filter that steers the car back does not drive the plan either.
+    assert unhealthy >= blackouts if name == "shielded" else unhealthy == blackouts
     assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:9][healthy]))
 
 

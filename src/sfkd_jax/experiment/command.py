@@ -131,7 +131,8 @@ def settings_of(composed: DictConfig) -> Settings:
 
 def _typed() -> list[str]:
     """The overrides of the running command, as they were typed."""
-    return [*HydraConfig.get().overrides.task]
+    # A program that calls a command as a function has typed nothing.
+    return [*HydraConfig.get().overrides.task] if HydraConfig.initialized() else []
 
 
 def compose(*overrides: str) -> Settings:

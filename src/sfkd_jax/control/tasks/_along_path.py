@@ -258,11 +258,11 @@ class FollowingLaw(LawTask):
         return StepResult(sample, cost, control, effective, coordinates)
 
 
-following_law = factory(FollowingLaw, lambda around: around.task(_check))
+following_law = factory(FollowingLaw, lambda around: around.task(check_preview))
 """(model, cost, law, settings of `FollowingLaw`) -> `Task`."""
 
 
-def _check(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
+def check_preview(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
     """Raise a ValueError if there is no preview of this horizon."""
     if not isinstance(preview, Preview):
         raise ValueError(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
-from sfkd_jax.control.tasks._along_path import Preview
+from sfkd_jax.control.tasks._along_path import Preview, check_preview
 from sfkd_jax.control.wrappers._estimator import Applied, input_error
 from sfkd_jax.control.wrappers._innovations import (
     InnovationState,
@@ -211,7 +211,7 @@ class Gate:
             inner=self.inner.init(key),
             expected=jnp.full(size, jnp.nan, dtype=float),
             modelled=jnp.asarray(False),
-            along=jnp.full((), jnp.nan),
+            along=jnp.full((), jnp.nan, dtype=float),
             missing=jnp.zeros(size, jnp.int32),
             skew=jnp.zeros(()),
             doubt=jnp.zeros((), jnp.int32),
@@ -229,6 +229,7 @@ class Gate:
         preview: Preview,
     ) -> tuple[Control, GateState, ControllerInfo]:
         """Take one control step."""
+        check_preview(coordinates, env, preview, self.horizon)
         readable = all_finite(preview.road)
         moved_on = jnp.concatenate([state.road[1:], state.road[-1:]])
         road = jnp.where(readable, preview.road, moved_on)
