@@ -129,11 +129,12 @@ class ExportedController:
             if name in measured:
                 given[name] = given[name].astype(np.float32)
             elif name.endswith("tuning.elapsed") and elapsed is not None:
-                given[name] = np.float32(elapsed)
+                given[name] = np.asarray(elapsed, np.float32)
         values = self._act(*given.values())
         state, info = (self._named("act", root, values) for root in ("state", "info"))
         if origin.any():
-            info["predicted_states"] = _shifted(info["predicted_states"], origin)
+            moved: Any = _shifted(info["predicted_states"], origin)
+            info["predicted_states"] = moved
         return values[0], state, info
 
     def _key(self, seed: int) -> jax.Array:
