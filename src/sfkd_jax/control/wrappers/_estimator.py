@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
-from sfkd_jax.geometry import PathState, path_state
-from sfkd_jax.types import BODY, Control, Environment, Model, Params, Scalar
+from sfkd_jax.control.wrappers._innovations import expected_coordinates
+from sfkd_jax.geometry import PathState
+from sfkd_jax.types import Control, Environment, Model, Params, Scalar
 
 FRICTION, WIND = 0, 1
 """Entries of e."""
@@ -221,9 +222,7 @@ class Loop(NamedTuple):
         road, env = applied.road, applied.env
         nu = applied.control - self.law(xi, road[0], road[1], env)
         fiber = self.model.fiber(params, env)
-        latent = self.model.encode(fiber, path_state(xi))
-        after = self.model.step(fiber, latent, jnp.concatenate([nu, road]))
-        return self.model.decode(fiber, after)[BODY]
+        return expected_coordinates(self.model, fiber, xi, nu, road)
 
     def force_slope(self, params: Params, applied: Applied, xi: PathState) -> PathState:
         """Return ∂ξ⁺/∂(relative side force) at a given control.
