@@ -19,7 +19,7 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
-CORE = {"types", "geometry", "rollout", "ranges"}
+CORE = {"types", "geometry", "rollout", "ranges", "paths", "lanes"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "doctor", "demo"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
 PLANT = CORE | {"plants", "scenarios"}
@@ -29,6 +29,8 @@ ARROWS = {
     "ranges": set(),
     "geometry": {"types"},
     "rollout": {"types", "geometry"},
+    "paths": {"types"},
+    "lanes": {"types", "paths"},
     "settings": {"ranges"},
     "store": set(),
     "plants": CORE,
@@ -75,9 +77,9 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 24_700, "tests": 15_250, "benchmarks, experiments": 2_300}
+LINES = {"src": 24_870, "tests": 15_320, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
-FILES_IN_SRC = 126
+FILES_IN_SRC = 128
 
 OPTIONS, EXPERIMENTS = 65, 10
 COMMITTED = {"*.json": 685_000, "figures": 2_600_000}

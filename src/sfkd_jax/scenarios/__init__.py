@@ -1,5 +1,12 @@
 """Driving scenarios: paths, environment schedules, S1 to S3."""
 
+from sfkd_jax.paths import Lap as Lap
+from sfkd_jax.paths import Path as Path
+from sfkd_jax.paths import path_from_curvature as path_from_curvature
+from sfkd_jax.paths import path_through as path_through
+from sfkd_jax.paths import point_at as point_at
+from sfkd_jax.paths import project as project
+from sfkd_jax.paths import reference_window as reference_window
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
 from sfkd_jax.scenarios._conditions import random_side_forces as random_side_forces
@@ -7,13 +14,6 @@ from sfkd_jax.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
-from sfkd_jax.scenarios._paths import Lap as Lap
-from sfkd_jax.scenarios._paths import Path as Path
-from sfkd_jax.scenarios._paths import path_from_curvature as path_from_curvature
-from sfkd_jax.scenarios._paths import path_through as path_through
-from sfkd_jax.scenarios._paths import point_at as point_at
-from sfkd_jax.scenarios._paths import project as project
-from sfkd_jax.scenarios._paths import reference_window as reference_window
 from sfkd_jax.scenarios._paths import smooth_path as smooth_path
 from sfkd_jax.scenarios._scenarios import ROADS as ROADS
 from sfkd_jax.scenarios._scenarios import Family as Family

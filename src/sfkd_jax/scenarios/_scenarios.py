@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
+from sfkd_jax.paths import Path
 from sfkd_jax.ranges import Positive, Span
 from sfkd_jax.scenarios._conditions import (
     Schedule,
@@ -15,7 +16,7 @@ from sfkd_jax.scenarios._conditions import (
     uniform_road,
     wet_road,
 )
-from sfkd_jax.scenarios._paths import Path, double_lane_change, smooth_path
+from sfkd_jax.scenarios._paths import double_lane_change, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.tasks._task import StepIndex, Task
+from sfkd_jax.lanes import outside_box
 from sfkd_jax.types import Control, Scalar
 
 Violations: TypeAlias = Float[Array, " constraint"]
@@ -65,14 +66,7 @@ def outside_boxes(
         margin: by which each is enlarged, with round corners [m].
     """
     away = position - boxes[:, :2]
-    cos, sin = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
-    local = jnp.stack(
-        [cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]], 1
-    )
-    # Outside: distance to the nearest corner or side; inside: to the nearest side.
-    beyond = jnp.abs(local) - 0.5 * boxes[:, 3:]
-    outside = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=1) + 1e-12)
-    return margin - (outside + jnp.minimum(jnp.max(beyond, axis=1), 0.0))
+    return margin - outside_box(away, boxes[:, 2], 0.5 * boxes[:, 3:])
 
 
 def at_step(values: Array, at: StepIndex) -> Array:
