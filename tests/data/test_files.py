@@ -220,6 +220,17 @@ def stale(columns):
     columns.update({name: columns[name][held] for name in ("p_x", "p_y")})
 
 
+def late(names, steps):
+    """The columns come some rows after the others."""
+
+    def shift(columns):
+        for name, values in columns.items():
+            kept = slice(0, -steps) if name in names else slice(steps, None)
+            columns[name] = values[kept]
+
+    return shift
+
+
 def back_and_forth(columns):
     """Half of the run, then the same way in reverse."""
     rows = np.append(np.arange(151), np.arange(150)[::-1])
@@ -232,7 +243,34 @@ def unsigned(columns):
     columns["v"] = np.abs(columns["v"])
 
 
+def straight(columns):
+    travelled = 0.1 * np.cumsum(columns["v"]) - 0.05 * columns["v"]
+    small = {"yaw": 1e-3 * columns["yaw"], "steering": 1e-3 * columns["steering"]}
+    columns |= small | {"p_x": travelled, "p_y": 0.0 * travelled}
+
+
+def on_earth(write, *axes):
+    """Positions in UTM, some axes written as float32."""
+
+    def spoil(columns):
+        for axis, far in (("p_x", 5e5), ("p_y", 4.5e6)):
+            values = columns[axis] + far
+            if axis in axes:
+                values = np.asarray([float(write(np.float32(x))) for x in values])
+            columns[axis] = values
+
+    return spoil
+
+
 WRONG = {
+    "northing in float32": (
+        on_earth(float, "p_y"),
+        ", lines 2 to 302: p_y has a resolution of 0.5 m; log positions as float64",
+    ),
+    "easting in float32": (
+        on_earth("{:.2f}".format, "p_x"),
+        ", lines 2 to 302: p_x has a resolution of 0.031 m",
+    ),
     "nan": (
         change("yaw", 7, np.nan),
         ", line 9: yaw is nan; dataset.missing=drop leaves such rows out",
@@ -257,9 +295,18 @@ WRONG = {
         "positions are probably in cm",
     ),
     "unsigned": (unsigned, "the robot moves against the sign of v (14"),
+    "late positions": (
+        late(("p_x", "p_y"), 3),
+        "the lag of p_x, p_y behind v is 0.3 s (3 steps of vehicle.dt)",
+    ),
+    "late speed": (late("v", 2), "the lag of p_x, p_y behind v is -0.2 s (-2 steps"),
+    "late yaw": (
+        late(("yaw",), 3),
+        "the lag of yaw behind the direction of travel is 0.27 s (2.7 steps",
+    ),
     "swapped controls": (
         swap("steering", "acceleration"),
-        "yaw follows acceleration, not steering; swap the columns?",
+        "yaw follows acceleration (correlation 1.00), not steering (0.",
     ),
     "yaw and v": (
         swap("yaw", "v"),
@@ -310,11 +357,12 @@ TEXTS = {
     "empty": ("", ": the file is empty"),
     "no header": (
         "0,1,2\n1,2,3\n",
-        ": no column t among 0, 1, 2; map it with dataset.columns.time",
+        ", line 1: numbers where the names of the columns should be",
     ),
     "a logger alone": (
         '"Format","MoTeC CSV File"\n\n' + "0," * 8 + "0\n",
-        ", line 3: 9 cells below a header of 2",
+        f", line 1 is no header: 2 cells above rows of 9, and no line has one of the "
+        f"names {', '.join(NAMES)}; set dataset.columns",
     ),
     "twice": ("t,t\n0,1\n", ", line 1: the column t appears twice"),
     "ragged": (
@@ -346,6 +394,9 @@ RECORDERS = {
     "a logger's head": lambda text: f"# logger X1, t in s\n#v 2\n{text}".encode(),
     "a header of numpy": lambda text: f"# {text}".encode(),
     "comments": lambda text: f"# made by us\n{text}# the end\n\n".encode(),
+    "units": lambda text: text.replace(
+        "\n", f"\ns,m,m,rad,m/s{',-' * 4}\n", 1
+    ).encode(),
 }
 
 
@@ -513,6 +564,14 @@ def test_invalid_columns_are_refused(tmp_path, columns, message):
     ("spoil", "options", "message"),
     [
         (scale("steering", np.negative), {}, "the robot turns against steering"),
+        (late(("p_x", "p_y"), 1), {}, "behind v is 0.1 s (1 steps of vehicle.dt)"),
+        (late(NAMES[1:5], 1), {}, "the lag of v behind acceleration is 0.05 s (0.5"),
+        (straight, {}, "yaw turns by 0.014 degrees a second (root"),
+        (
+            straight,
+            {},
+            "steering stays between -0.000229 and 0.000238, and so will the controller",
+        ),
         (scale("steering", np.sign), {}, "steering takes only 2 values"),
         (scale("yaw", lambda yaw: yaw + 1.0), {}, "differ by -1.00 rad throughout"),
         (
@@ -536,11 +595,17 @@ def test_oddities_are_warned_of(tmp_path, spoil, options, message):
     )
 
 
-def test_driving_backwards_is_right(tmp_path):
+def test_a_yaw_rate_shows_a_late_yaw_and_driving_backwards_is_right(tmp_path):
+    columns = recorded_run()
+    columns["rate"] = 0.36 * np.cos(0.4 * columns["t"])
+    names = Columns(state=(*STATE, "rate"))
+    late(("yaw",), 2)(columns)
+    line = refusal(write_csv(tmp_path / "a.csv", columns), names)
+    assert "(the first of 2 findings)" in line
     columns = recorded_run()
     back_and_forth(columns)
     _, lines = read(write_csv(tmp_path / "a.csv", columns))
-    assert not [line for line in lines if "against" in line]
+    assert not [line for line in lines if "against" in line or "the lag of yaw" in line]
 
 
 def test_the_box_of_environments_is_what_logs_reach_or_what_is_asked(tmp_path):

@@ -8,9 +8,19 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from sfkd_jax.data._logs import LOOK, Chords, Columns, Log, agreement, find_chords
+from sfkd_jax.data._logs import (
+    FEWEST,
+    LOOK,
+    Chords,
+    Columns,
+    Delay,
+    Log,
+    agreement,
+    find_chords,
+    find_delay,
+)
 from sfkd_jax.data._tables import DROP
 
 Bounds: TypeAlias = tuple[tuple[float, ...] | None, tuple[float, ...] | None]
@@ -28,6 +38,8 @@ STALE = 0.2
 """Share of driving rows that repeat the position of the row before, from which
 positions count as stale.
 """
+COARSEST = 0.02
+"""Resolution of positions up to which a log is used [m]."""
 AGREE = (0.8, 1.25)
 """Path length over integrated speed of a plausible log."""
 DEGREES = 9e-6
@@ -45,6 +57,8 @@ FACTORS = (
     (DEGREES, "positions are probably degrees of latitude and longitude"),
     (57.29578, "the speed is probably an angular rate, or columns changed places"),
 )
+LATE = 1.5
+"""Steps by which positions or yaw may be late: a model knows the last state alone."""
 CUT_THERE = "; the run is cut there"
 
 
@@ -122,6 +136,7 @@ class Checks:
         if not any(one.refused for one in units):
             found += self._sampling(log)
             found += self._motion(log)
+            found += self._delays(log)
         return log, found
 
     def _drop_missing_rows(self, log: Log) -> tuple[Log, list[Finding]]:
@@ -206,7 +221,7 @@ class Checks:
             )
 
     def _motion(self, log: Log) -> Iterator[Finding]:
-        """Stale positions, else jumps of position and yaw."""
+        """Stale positions, else rounded ones, else jumps of position and yaw."""
         if (stale := _stale(log)).any():
             speed, advice = log.states[1:, 3], "; log positions as often as "
             yield from _first(
@@ -215,9 +230,29 @@ class Checks:
                 lambda k: f"the position of the row before at {speed[k]:.3g} m/s",
                 hint=f"{advice}{self.columns.time}, or leave rows out",
             )
+        elif rounded := list(self._rounded(log)):
+            yield from rounded
         else:
             for find in (self._position_jumps, self._yaw_jumps):
                 yield from _first(log, *find(log))
+
+    def _rounded(self, log: Log) -> Iterator[Finding]:
+        """Axes with few values, as float32 has far from the origin."""
+        speed, yaw = (log.states[:, k] for k in (3, 2))
+        driven = (0.5 * (speed[1:] + speed[:-1]) * log.waits)[log.joined]
+        for axis, part in enumerate((np.cos, np.sin)):
+            places, along = log.states[:, axis], driven * part(yaw[1:][log.joined])
+            reach = float(np.ptp(np.cumsum(along)))
+            # Of a metre, not of the way: a car takes every value of a grid only once.
+            count = len(np.unique(np.round(places % 1.0, 6) % 1.0))
+            off = float(np.std(np.diff(places)[log.joined] - along))
+            # A simulated car may move in whole metres, and is where its speed says.
+            few = count < min(1.0 / COARSEST, len(along) / 3)
+            if few and reach > 1.0 and off * count > 0.2:
+                yield Finding(
+                    f"{log.whole}: {self.columns.state[axis]} has a resolution of "
+                    f"{1 / count:.2g} m; log positions as float64, or near the origin"
+                )
 
     def _reversals(self, log: Log, chords: Chords) -> Iterator[Finding]:
         """A stretch in reverse at a speed without a sign, among others ahead."""
@@ -236,6 +271,60 @@ class Checks:
                     "it is negative where the robot reverses"
                 )
                 return
+
+    def _delays(self, log: Log) -> Iterator[Finding]:
+        """Positions and yaw that are late against speed, yaw rate and course."""
+        if not log.joined.any() or _stale(log).any():
+            return
+        x, y, yaw, speed = self.columns.state[:4]
+        parts, yaws = log.parts(self.gap, self.dt), np.unwrap(log.states[:, 2])
+
+        def delay(*columns: Float[np.ndarray, "time ..."]) -> Delay:
+            table = np.column_stack([log.time, *columns])
+            return find_delay(table[rows] for rows in parts)
+
+        found = {
+            (f"{x}, {y}", speed): delay(log.states[:, :2], log.states[:, 3]),
+            (yaw, "the direction of travel"): self._behind_course(log),
+        }
+        for k, name in enumerate(self.columns.state[4:], start=4):
+            rated = delay(yaws, log.states[:, k])
+            # Whatever else its unit, this column is the yaw rate.
+            if rated.alike > 0.95 and 0.8 < abs(rated.gain) < 1.25:
+                found[yaw, name] = rated
+        for (late, early), one in found.items():
+            size = max(0.9 * log.period, 0.1 * self.dt)
+            if one.certain and one.alike > 0.7 and abs(one.lag) >= size:
+                yield Finding(
+                    f"{log.whole}: {one.line(late, early, self.dt)}",
+                    refused=abs(one.lag) >= LATE * self.dt,
+                )
+
+    def _behind_course(self, log: Log) -> Delay:
+        """How late yaw is, of how its angle to the course follows the yaw rate.
+
+        A position ahead of the rear axle turns the course by its distance times yaw
+        rate over speed. That distance is fitted too, about half a wheelbase.
+        """
+        chords = find_chords(log, log.states[:, 3])
+        speed = log.states[chords.middle, 3]
+        count = len(speed) * log.period / LOOK
+        moves = np.abs(speed) > 0.0
+        if count < 0.5 * FEWEST or not moves.all() or np.std(chords.turn) < 1e-3:
+            return Delay()
+        off = chords.course - chords.yaw
+        off = np.angle(np.exp(1j * (off - np.angle(agreement(off)))))
+        causes = np.column_stack([np.ones_like(off), chords.turn, chords.turn / speed])
+        rest = off - causes @ np.linalg.lstsq(causes, off, rcond=None)[0]
+        # Neighbouring chords overlap: as many count as fit one after another.
+        weight = count / len(off) / max(float(np.mean(rest**2)), 1e-12)
+        prior = np.array([1e-9, 1e-9, 16.0 / self.wheelbase**2])
+        inverse = np.linalg.inv(weight * causes.T @ causes + np.diag(prior))
+        mean = inverse @ (weight * causes.T @ off + prior * 0.5 * self.wheelbase)
+        lag, spread = float(mean[1]), float(np.sqrt(inverse[1, 1]))
+        alike = np.sqrt(max(0.0, 1.0 - np.mean(rest**2) / max(np.var(off), 1e-12)))
+        # Tyres that slip make yaw look early.
+        return Delay(lag, float(alike), certain=lag > 5.0 * spread)
 
     def _position_jumps(self, log: Log) -> Jumps:
         """Steps much longer than the speed explains."""

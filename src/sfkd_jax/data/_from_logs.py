@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -25,7 +24,7 @@ from sfkd_jax.data._dataset import (
     pieces,
     segments,
 )
-from sfkd_jax.data._logs import Columns, Log, read_logs
+from sfkd_jax.data._logs import Columns, Delay, Log, find_chords, find_delay, read_logs
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
 from sfkd_jax.store import open_regular
 from sfkd_jax.types import BODY, Trajectory
@@ -35,6 +34,8 @@ MOST_LINES = 20
 """Warnings that are reported in full; of more, only their number."""
 ROUNDED = 1e-5
 """How far outside its range a channel may be: float32 rounds."""
+STRAIGHT, TINY = 1.0, 0.01
+"""Yaw rate [degrees/s] and range of a control below which a log teaches too little."""
 ALIKE = 1e-3
 """Of a channel's standard deviation: to this step numbers are rounded and compared."""
 IN_A_ROW = 10
@@ -110,7 +111,7 @@ def from_logs(
     checks = Checks(columns, dt, steps, wheelbase, *cuts, limits, box)
     logs, findings = checks.apply(recorded)
     if logs:
-        for check in (_steering, _ranges, _repeats):
+        for check in (_steering, _ranges, _commands, _repeats):
             findings += check(checks, logs)
     _report_findings([*map(Finding, errors), *findings], report)
     cut, runs = segments([list(pieces(log, dt, gap)) for log in logs], steps)
@@ -205,14 +206,17 @@ def _marks(
 
 
 def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
-    """Yaw rates against a bicycle's, ω = v tan δ / L: column, sign, unit and L."""
-    (alike, fits), (swapped, _) = (_turns(logs, channel) for channel in (0, 1))
-    (name, other), where = checks.columns.control, _span(logs)
-    if abs(alike) < 0.4 and swapped > 0.8:
-        yield Finding(f"{where}: yaw follows {other}, not {name}; swap the columns?")
+    """Yaw rates against a bicycle's, ω = v tan δ / L: sign, unit and L."""
+    expected, turned = (
+        np.concatenate(parts) for parts in zip(*map(_turns, logs), strict=True)
+    )
+    power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
+    alike = float(np.mean(expected * turned)) / power if power else 0.0
     # Not a steering angle, or too little steering to tell.
     if abs(alike) < 0.6:
         return
+    fits = float(np.mean(expected**2) / np.mean(expected * turned))
+    name, where = checks.columns.control[0], _span(logs)
     if alike < 0:
         yield warning(
             f"{where}: the robot turns against {name}; "
@@ -290,20 +294,61 @@ def _span(logs: list[Log]) -> str:
     return logs[0].whole + more
 
 
-def _turns(logs: list[Log], channel: int) -> tuple[float, float]:
-    """Correlation of v tan δ with the yaw rate, and its factor, for a control as δ."""
-    expected, turned = [], []
+def _commands(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
+    """Motion against commands: columns that changed places, delays, no excitation."""
+    yaw, speed, controls = *checks.columns.state[2:4], checks.columns.control
+
+    def answer(chosen: list[Log], state: int, control: int) -> Delay:
+        """The delay of yaw or speed behind a command; a turn is faster at speed."""
+        tables = []
+        for log in chosen:
+            rate = log.controls[:, control] * log.states[:, 3] ** (state == 2)
+            motion = np.unwrap(log.states[:, state]) if state == 2 else log.states[:, 3]
+            table = np.column_stack([log.time, motion, rate])
+            tables += [table[rows] for rows in log.parts(checks.gap, checks.dt)]
+        return find_delay(tables, held=True)
+
     for log in logs:
-        steering, joined = log.controls[:-1, channel], log.joined
-        # More than 80° is no angle of a wheel, but may be a turn command.
-        angle = np.tan(steering) if np.abs(steering).max() < 1.4 else steering
-        expected.append((log.states[:-1, 3] * angle)[joined])
-        yaw = np.unwrap(log.states[:, 2])
-        turned.append(np.diff(yaw)[joined] / log.waits[joined])
-    rates, yaw_rates = np.concatenate(expected), np.concatenate(turned)
-    common, own = float(np.mean(rates * yaw_rates)), float(np.mean(rates**2))
-    power = math.sqrt(own * np.mean(yaw_rates**2))
-    return (common / power, own / common) if common else (0.0, 0.0)
+        turns, pushes = ([answer([log], k, n).alike for n in (0, 1)] for k in (2, 3))
+        swapped = turns[1] > 0.8 or (pushes[0] > 0.8 and pushes[1] < 0.4)
+        if turns[0] < 0.4 and swapped:
+            yield Finding(
+                f"{log.whole}: {yaw} follows {controls[1]} (correlation "
+                f"{turns[1]:.2f}), not {controls[0]} ({turns[0]:.2f}); "
+                "have columns changed places?"
+            )
+    for state, name, control in ((2, yaw, 0), (3, speed, 1)):
+        found = answer(logs, state, control)
+        steps = found.lag / checks.dt
+        # Half a step early: a command that was measured, or interpolated.
+        if found.certain and found.alike > 0.8 and (steps < -1.0 or steps > 0.25):
+            yield warning(
+                f"{_span(logs)}: {found.line(name, controls[control], checks.dt)}, "
+                "unless a state shows the delay"
+            )
+    turn = np.concatenate([find_chords(log, log.states[:, 3]).turn for log in logs])
+    if turn.size and (rate := np.rad2deg(np.sqrt(np.mean(turn**2)))) < STRAIGHT:
+        yield warning(
+            f"{_span(logs)}: {yaw} turns by {rate:.2g} degrees a second (root mean "
+            "square); record curves, or the model learns none"
+        )
+    for k, name in enumerate(controls):
+        values = np.concatenate([log.controls[:, k] for log in logs])
+        low, high = np.quantile(values, [0.001, 0.999])
+        if 0.0 < high - low < TINY:
+            yield warning(
+                f"{_span(logs)}: {name} stays between {low:.3g} and {high:.3g}, and so "
+                "will the controller; vary it more, or set vehicle.control_low and high"
+            )
+
+
+def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
+    """v tan δ and the yaw rate of every step; large controls are taken as tan δ."""
+    steering = log.controls[:-1, 0]
+    # More than 80° is no angle of a wheel, but may be a turn command.
+    angle = np.tan(steering) if np.abs(log.controls[:, 0]).max() < 1.4 else steering
+    turned = np.diff(np.unwrap(log.states[:, 2]))[log.joined] / log.waits[log.joined]
+    return (log.states[:-1, 3] * angle)[log.joined], turned
 
 
 def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> None:

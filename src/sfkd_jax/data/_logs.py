@@ -28,6 +28,8 @@ DIMENSIONS = ("length", "length", "angle", "speed")
 """Of the first states."""
 LOOK = 0.5
 """Length of the chords over which motion is compared with the columns [s]."""
+LATEST, LAGS, FEWEST = 1.0, 401, 20
+"""Largest delay that is looked for [s], how many are, and chords that it takes."""
 RUN = "number of the run"
 """Column of tables of arrays x, u, e."""
 
@@ -212,6 +214,71 @@ def find_chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
         0.5 * (yaw[middle] + yaw[after]),
         (yaw[first + reach] - yaw[first]) / lasted[moving],
         middle,
+    )
+
+
+class Delay(NamedTuple):
+    """How much later a motion comes than the rate that should be its derivative.
+
+    Attributes:
+        lag: at which they agree best [s]; negative if the motion comes first.
+        alike: absolute correlation at that lag.
+        gain: of the motion over the integrated rate.
+        certain: whether a lag of zero agrees worse, beyond chance.
+    """
+
+    lag: float = 0.0
+    alike: float = 0.0
+    gain: float = 0.0
+    certain: bool = False
+
+    def line(self, late: str, early: str, dt: float) -> str:
+        """Return what is said of it, in periods dt of the model."""
+        return (
+            f"the lag of {late} behind {early} is {self.lag:.2g} s "
+            f"({self.lag / dt:.2g} steps of vehicle.dt); shift one of them in time"
+        )
+
+
+def find_delay(
+    tables: Iterable[Float[np.ndarray, "_ column"]], *, held: bool = False
+) -> Delay:
+    """Find the delay of a motion behind a rate by correlation over chords of `LOOK`.
+
+    Args:
+        tables: time [s], motion (of two columns: a position) and rate (of a position: a
+            speed) of uninterrupted stretches.
+        held: whether the rate holds from its row on, as a command does.
+    """
+    lags = np.linspace(-LATEST, LATEST, LAGS)
+    motion, summed = [np.zeros(0)], [np.zeros((LAGS, 0))]
+    for time, *moved, rate in (table.T for table in tables):
+        between = rate[:-1] if held else 0.5 * (rate[1:] + rate[:-1])
+        along = np.append(0.0, np.cumsum(between * np.diff(time)))
+        starts = np.arange(time[0] + LATEST, time[-1] - LATEST - LOOK, 0.5 * LOOK)
+        ends = np.stack([starts, starts + LOOK])
+        summed.append(
+            np.diff(np.interp(ends[:, None] - lags[:, None], time, along), axis=0)[0]
+        )
+        chords = [np.diff(np.interp(ends, time, one), axis=0)[0] for one in moved]
+        if chords[1:]:  # a distance has no sign of its own
+            chords = [np.sign(summed[-1][LAGS // 2]) * np.hypot(*chords)]
+        motion += chords
+    seen, expected = np.concatenate(motion), np.concatenate(summed, axis=1)
+    if (count := len(seen)) < FEWEST:
+        return Delay()
+    seen, expected = seen - seen.mean(), expected - expected.mean(axis=1, keepdims=True)
+    power = np.sum(expected**2, axis=1)
+    if not (seen.any() and power.min() > 0.0):
+        return Delay()
+    gains = expected @ seen / power
+    fit = gains**2 * power / np.sum(seen**2)
+    best = int(fit.argmax())
+    # The log of a likelihood ratio: every other chord overlaps its neighbours.
+    ratio = (1.0 - fit[LAGS // 2] + 1e-9) / (1.0 - fit[best] + 1e-9)
+    certain = bool(0.25 * count * np.log(ratio) > 10.0)
+    return Delay(
+        float(lags[best]), float(np.sqrt(fit[best])), float(gains[best]), certain
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 import re
+import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -16,6 +17,10 @@ from jaxtyping import Float, Int, Shaped
 
 from sfkd_jax.store import open_regular
 
+DECODED = 1 << 29
+"""Largest decoded size of an npz or parquet file [bytes]: few bytes may encode any
+number of equal values.
+"""
 PREAMBLE = 50
 """Lines of a csv file among which its header is looked for."""
 DROP = "; dataset.missing=drop leaves such rows out"
@@ -49,6 +54,9 @@ SPELLINGS = {
     "kNm": "kN*m",
 }
 """Spellings in logs that pint does not know, or takes for something else."""
+_TERM = r"[A-Za-zµμ°%]+(?:\^?[1-4]|[²³])?"
+WRITTEN = re.compile(rf"(?:1|{_TERM})(?:\s*[ */·]\s*{_TERM})*")
+"""What is shown to pint, which computes whatever is written: 9**9**9 takes for ever."""
 
 
 class Table(NamedTuple):
@@ -116,30 +124,28 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
     """Read the configured columns of a csv file.
 
     Cells are separated by commas, semicolons, tabs or blanks; # begins a comment. Lines
-    before the header are skipped.
+    before the header are skipped, a line of units below it is added to the names.
 
     Args:
         file: as UTF-8, UTF-16 with its mark, or else Windows-1252.
         wanted: names of columns; the header is the line that has most of them.
         blanks: whether empty cells are NaN; otherwise they are text.
     """
-    from pyarrow import csv  # quick to load for whoever reads none
-
+    with _optional("pyarrow", f"{file}: csv files need"):
+        from pyarrow import csv
     # A log may be half as large as the memory: no copy outlives its use.
     lines = _text(file).splitlines()
     filled = [k for k, line in enumerate(lines) if line.strip()]
     if not filled:
         raise ValueError(f"{file}: the file is empty")
-    # The line that has most of the configured names; numpy writes it as a comment.
-    heads = {k: _cells(lines[k].lstrip("# "))[0] for k in filled[:PREAMBLE]}
-    header = max(
-        heads, key=lambda k: (len(among(heads[k], wanted)), lines[k][:1] != "#")
-    )
+    header = _header(file, lines, filled, wanted)
     names, between = _cells(lines[header].lstrip("# "))
     where = f"{file}, line {header + 1}"
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
         raise ValueError(f"{where}: the column {twice[0]} appears twice")
     kept = [k for k in filled if k > header and not lines[k].startswith("#")]
+    if kept and (units := _with_units(names, _cells(lines[kept[0]], between)[0])):
+        names, kept = units, kept[1:]
     if not kept:
         raise ValueError(f"{file}: no rows below the header")
     rows = np.array(kept) + 1
@@ -187,6 +193,30 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
     return Table(str(file), columns, tuple(names), rows, "line")
 
 
+def _header(
+    file: Path, lines: list[str], filled: list[int], wanted: Collection[str]
+) -> int:
+    """The index of the line that has most of the configured names.
+
+    Without any it is the first that is no comment, if it is as long as a row.
+    """
+    # numpy writes headers as comments.
+    heads = {k: _cells(lines[k].lstrip("# "))[0] for k in filled[:PREAMBLE]}
+    held = {k: len(among(cells, wanted)) for k, cells in heads.items()}
+    if max(held.values()):
+        return max(held, key=lambda k: held[k])
+    first = next((k for k in heads if not lines[k].startswith("#")), filled[0])
+    where = f"{file}, line {first + 1}"
+    if all(map(_is_number, heads[first])):
+        raise ValueError(f"{where}: numbers where the names of the columns should be")
+    if len(heads[first]) != (cells := len(_cells(lines[filled[-1]])[0])):
+        raise ValueError(
+            f"{where} is no header: {len(heads[first])} cells above rows of {cells}, "
+            f"and no line has one of the names {', '.join(wanted)}; set dataset.columns"
+        )
+    return first
+
+
 def among(headers: Iterable[str], wanted: Collection[str]) -> list[str]:
     """Those headers that are a configured name, with or without a unit behind it."""
     return [one for one in headers if one in wanted or name_of(one) in wanted]
@@ -228,26 +258,48 @@ def _is_number(value: Any) -> bool:
 
 
 def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
-    """Return the arrays of an npz file, none of them objects."""
-    # Pickles would run code.
-    with _opened(file, "npz") as stream, np.load(stream, allow_pickle=False) as opened:
-        return {name: opened[name] for name in opened.files}
+    """Return the arrays of an npz file, of at most DECODED bytes and no objects."""
+    with _opened(file, "npz") as stream:
+        with zipfile.ZipFile(stream) as packed:
+            _check_decoded(sum(part.file_size for part in packed.infolist()))
+        stream.seek(0)
+        # Pickles would run code.
+        with np.load(stream, allow_pickle=False) as opened:
+            return {name: opened[name] for name in opened.files}
 
 
 def read_parquet(file: Path, wanted: Collection[str]) -> Table:
-    """Read the configured columns of a parquet file."""
-    from pyarrow import parquet
-
+    """Read the configured columns of a parquet file, of at most DECODED bytes."""
+    with _optional("pyarrow", f"{file}: parquet files need"):
+        from pyarrow import parquet
     with _opened(file, "parquet") as stream:
         opened = parquet.ParquetFile(stream)
+        about = opened.metadata
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        cells = [max(about.num_rows, 0) * about.num_columns]
+        # A hostile file may declare fewer rows in one place than in another.
+        cells += [sum(max(one.num_rows, 0) * one.num_columns for one in groups)]
+        columns = [one.column(k) for one in groups for k in range(one.num_columns)]
+        cells += [sum(max(column.num_values, 0) for column in columns)]
+        pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
+        _check_decoded(max(8 * max(cells), pages))
         names = opened.schema_arrow.names
         held = opened.read(among(names, wanted))
-    if not held.num_rows:
+    if not about.num_rows:
         raise ValueError(f"{file}: no rows")
     if len(set(names)) < len(names):
         raise ValueError(f"{file}: two columns have one name")
     arrays = {name: held.column(name).to_numpy() for name in held.column_names}
-    return Table(str(file), arrays, tuple(names), np.arange(held.num_rows))
+    return Table(str(file), arrays, tuple(names), np.arange(about.num_rows))
+
+
+@contextmanager
+def _optional(package: str, need: str) -> Iterator[None]:
+    """Name the extra of a package that is not installed."""
+    try:
+        yield
+    except ImportError:
+        raise ValueError(f'{need} {package}: pip install "sfkd-jax[train]"') from None
 
 
 @contextmanager
@@ -259,6 +311,14 @@ def _opened(file: Path, kind: str) -> Iterator[BinaryIO]:
         except Exception as reason:  # a damaged file raises nearly anything
             first = (str(reason).splitlines() or [type(reason).__name__])[0]
             raise ValueError(f"{file}: not a readable {kind} file ({first})") from None
+
+
+def _check_decoded(size: int) -> None:
+    """Refuse what would fill the memory."""
+    if size > DECODED:
+        raise ValueError(
+            f"{size >> 20} MiB once decoded, at most {DECODED >> 20} are read"
+        )
 
 
 def find_column(
@@ -305,6 +365,8 @@ def find_unit(symbol: str) -> tuple[str, float] | None:
     # As written first: units may differ in capitals, such as mm and Mm.
     for spelling in (symbol, symbol.lower()):
         written = SPELLINGS.get(spelling, spelling)
+        if not WRITTEN.fullmatch(written) and written != "standard_gravity":
+            continue
         # m/s2 means m/s^2.
         power = re.sub(r"(?<=[A-Za-z])([1-4])", r"^\1", written).replace("·", "*")
         units, dimensions = _registry()
@@ -320,8 +382,8 @@ def find_unit(symbol: str) -> tuple[str, float] | None:
 @cache
 def _registry() -> tuple[Any, dict[str, str]]:
     """Pint's units, and the dimension of every SI unit in base units."""
-    import pint
-
+    with _optional("pint", "units in column names need"):
+        import pint
     units = pint.UnitRegistry()
     bases = {
         dimension: units.parse_units(SPELLINGS.get(symbol, symbol))
@@ -342,3 +404,19 @@ def split_unit(header: str) -> tuple[str, str | None]:
 def name_of(header: str) -> str:
     """Return the name of a column without its unit."""
     return split_unit(header)[0]
+
+
+def _with_units(names: list[str], cells: list[str]) -> list[str] | None:
+    """Names with the units of the line below them; None if that line has none."""
+    symbols = [cell.strip("()[] ") for cell in cells]
+    # A row of data has numbers; "1" and "-" alone do not make a line of units.
+    if len(cells) != len(names) or any(symbol[:1].isdigit() for symbol in symbols):
+        return None
+    if not all(symbol == "" or find_unit(symbol) for symbol in symbols):
+        return None
+    if not any(symbol.strip("-") for symbol in symbols):
+        return None
+    return [
+        f"{name} [{symbol}]" if symbol and split_unit(name)[1] is None else name
+        for name, symbol in zip(names, symbols, strict=True)
+    ]
