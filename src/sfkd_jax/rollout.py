@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, PATH_SPEED, rotate, wrap_angle
+from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -178,26 +178,6 @@ def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Tra
     states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
     inside = starts[:, None] + jnp.arange(horizon)
     return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
-
-
-def prediction_errors(
-    predicted: Float[Array, "horizon state"],
-    window: Trajectory,
-    *,
-    along_path: bool = False,
-) -> Float[Array, "horizon 3"]:
-    """Return the errors of position [m], yaw [rad] (wrapped) and body state, as norms.
-
-    Along a path: |e_y| [m], |e_ψ| [rad], 2-norm of the vehicle's own body state.
-    """
-    gap = predicted - window.states[1:]
-    position, yaw, body = gap[:, :2], gap[:, 2:3], gap[:, BODY]
-    # The pose of a path state is 0 throughout and would count as a perfect prediction.
-    if along_path:
-        position, yaw, body = jnp.split(body, (HEADING, PATH_SPEED), axis=1)
-    return jnp.column_stack(
-        [jnp.linalg.norm(kind, axis=1) for kind in (position, wrap_angle(yaw), body)]
-    )
 
 
 def state_errors(

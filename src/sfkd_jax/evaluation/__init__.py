@@ -26,6 +26,4 @@ from sfkd_jax.evaluation._statistics import p_value as p_value
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
 from sfkd_jax.evaluation._violations import ClaimedBounds as ClaimedBounds
-from sfkd_jax.evaluation._violations import Predictions as Predictions
-from sfkd_jax.evaluation._violations import predictions as predictions
 from sfkd_jax.evaluation._violations import violations as violations

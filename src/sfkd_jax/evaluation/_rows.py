@@ -79,7 +79,7 @@ def disturbed(
     return {
         "force_n": force,
         "rmse_m": pooled["rmse_m"],
-        **{name: violation[name] for name in ("v0", "v1", "v2")},
+        **violation,
         "departures": pooled["departures"],
     }
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
-from sfkd_jax.certification import latent_tube
 from sfkd_jax.data import Dataset, to_path
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
@@ -25,7 +24,7 @@ from sfkd_jax.plants import check_step
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.scenarios import Scenario
 from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.types import Key, Params, Trajectory
+from sfkd_jax.types import Key, Params, Scalar, Trajectory
 
 WARM_UP = 10
 """Control steps before timing starts."""
@@ -178,7 +177,7 @@ class SystemEvaluation:
             observation_noise=settings.evaluation.observation_noise,
         )
         self._simulate = _over_episodes(simulate)
-        self._predict = jax.jit(self._predictions)
+        self._violated = jax.jit(self._violations)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
@@ -216,17 +215,20 @@ class SystemEvaluation:
         episode = self._simulate(driven, episodes.keys)
         # Scored against e without the force, which no model knows.
         scores = evaluation.score(episode, np.asarray(known.envs), dt=self._plant.dt)
-        predicted = None
+        violation = dict.fromkeys(("v0", "v1"))
         # A prediction needs as many steps as a segment of the data set has.
-        if episode.controls.shape[1] >= self._settings.dataset.steps:
+        long = episode.controls.shape[1] >= self._settings.dataset.steps
+        if long and self._claims is not None:
             seen = Trajectory(episode.states, episode.controls, episode.assumed_envs)
-            predicted = jax.device_get(self._predict(self.params, seen, known))
-        return episode, scores, evaluation.violations(predicted, self._claims)
+            shares = self._violated(self.params, seen, known)
+            for name, share in jax.device_get(shares).items():
+                violation[name] = float(share) if np.isfinite(share) else None
+        return episode, scores, violation
 
-    def _predictions(
+    def _violations(
         self, params: Params, seen: Trajectory, scenarios: Scenario
-    ) -> evaluation.Predictions:
-        """Errors of predictions along episodes, in the coordinates of the model."""
+    ) -> dict[str, Scalar]:
+        """Violations of claims along episodes, in the coordinates of the model."""
 
         def convert(episode: Trajectory, scenario: Scenario) -> Trajectory:
             if self._system.law is None:
@@ -234,12 +236,12 @@ class SystemEvaluation:
             speeds = jnp.full(episode.controls.shape[0], scenario.speed)
             return to_path(episode, scenario.path, self._system.law, speeds)
 
-        return evaluation.predictions(
+        return evaluation.violations(
             self._system.model,
             params,
             jax.vmap(convert)(seen, scenarios),
+            self._claims,
             length=self._settings.dataset.steps,
-            horizon=self._settings.certification.horizon,
         )
 
     def _open_loop_rmse(self, dataset: Dataset) -> dict[str, float]:
@@ -290,21 +292,20 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
     }
 
 
-def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds:
-    """Claims about a system's predictions, of its certificate."""
+def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds | None:
+    """Claims of the certificate of a system about its predictions, or None."""
     level, horizon = settings.certification.level, settings.certification.horizon
-    claims = evaluation.ClaimedBounds(threshold=settings.evaluation.threshold_m)
     if system.certificate is None:
-        return claims
+        return None
     tube, d_bar = system.certificate["tube"], system.certificate["d_bar"]
     if (len(tube["latent"]), d_bar["level"]) != (horizon, level):
         store.print_message(
             "  the certificate is of another horizon or level and is not compared"
         )
-        return claims
-    latent = latent_tube(system.certificate["alpha"], d_bar["value"], horizon)
-    own = {"latent": latent, "d_bar": d_bar["value"], "certified": tube["physical"]}
-    return claims._replace(**own)
+        return None
+    radii = [tube["physical"][kind] for kind in ("position_m", "yaw_rad", "body")]
+    latent = jnp.asarray(tube["latent"])
+    return evaluation.ClaimedBounds(jnp.asarray(radii).T, latent, d_bar["value"])
 
 
 def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:

@@ -31,7 +31,6 @@ from sfkd_jax.ranges import (
     Names,
     NonNegativeInt,
     Numbers,
-    Positive,
 )
 from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
 
@@ -168,8 +167,6 @@ class EvaluationSettings:
             unit of survey grade.
         timed_steps: control steps whose time is measured.
         side_forces: side forces that no model knows [N].
-        threshold_m: δ* of V2 [m]: a round number below 1.15 m, the nominal model's 95 %
-            error within 2 s on S1.
     """
 
     episodes: int = 8
@@ -179,7 +176,6 @@ class EvaluationSettings:
     observation_noise: Numbers = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
     timed_steps: NonNegativeInt = 50
     side_forces: Numbers = ()
-    threshold_m: Positive = 1.0
 
 
 @takes()
