@@ -46,8 +46,9 @@ def control_step(name: str, samples: int, steps: int, **changes) -> dict[str, fl
     """Wall time of one control step, transfers of state and control included."""
     trained, loaded_policy = loaded(name, samples, **changes)
     episode = jax.jit(family(trained, 10.0))(jax.random.key(0))
-    reference = evaluation.first_reference(
-        episode, horizon=HORIZON, dt=trained.vehicle.dt
+    start, dt = jnp.zeros(()), trained.vehicle.dt
+    reference = scenarios.reference_window(
+        episode.path, start, episode.speed, dt=dt, horizon=HORIZON
     )
     act = jax.jit(loaded_policy.controller.act)
     memory = loaded_policy.controller.init(jax.random.key(0))

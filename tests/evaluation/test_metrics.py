@@ -9,11 +9,10 @@ import pytest
 
 from sfkd_jax.evaluation import Episode, pool, row, score
 from sfkd_jax.evaluation.formats import DASH
-from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Recording
+from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Recording, switches
 
 DT, STEPS = 0.1, 200
 TIME = np.arange(1, STEPS + 1) * DT
-CALM = np.broadcast_to([0.9, 0.0], (1, STEPS, 2))
 MEASURED = [metric for metric in METRICS if metric.measure]
 SHOWN = [metric for metric in METRICS if metric.label]
 LEVELS = (0.1, 0.2, 0.6, 0.9)
@@ -23,7 +22,6 @@ EXPECTED = {
     "rmse_m": (LEVELS, 0.45, 0.45),
     "rmse_episodes_m": (LEVELS, list(LEVELS), [*LEVELS, *LEVELS]),
     "max_deviation_m": (LEVELS, 0.9, 0.9),
-    "rmse_after_switch_m": ((math.nan, 0.2, 0.6, 0.9), 1.7 / 3, 1.7 / 3),
     "smoothness_rad_per_s": ((0.01, 0.02, 0.06, 0.09), 0.045, 0.045),
     "departures": ((False, False, False, True), 1, 2),
     "unhealthy_steps": ((0.1, 0.2, 0.6, 0.9), 0.45, 0.45),
@@ -49,15 +47,9 @@ def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True):
     )
 
 
-def switching(steps=STEPS, when=100, channel=0, to=0.3):
-    envs = np.array(np.broadcast_to([0.9, 0.0], (1, steps, 2)))
-    envs[0, when:, channel] = to
-    return envs
-
-
-def measured(name, lateral, envs=CALM, **changes):
+def measured(name, lateral, **changes):
     """A metric of one episode."""
-    return score(episode(lateral, **changes), envs, dt=DT)[name][0]
+    return score(episode(lateral, **changes), dt=DT)[name][0]
 
 
 def test_a_sinusoid_has_the_rmse_of_a_sinusoid():
@@ -73,23 +65,6 @@ def test_the_first_two_seconds_do_not_count():
     assert not measured("departures", lateral)
     late = np.where(TIME <= 2.1 + 1e-9, 5.0, 0.1)
     assert measured("max_deviation_m", late) == 5.0
-    switched = measured("rmse_after_switch_m", lateral, switching(when=10))
-    assert switched == pytest.approx(0.1)
-
-
-def test_exactly_the_three_seconds_after_a_switch_are_scored_apart():
-    """e_100 is the first after the switch; what it does is seen in the deviation of
-    x_101, which is lateral[100].
-    """
-    lateral = np.zeros(STEPS)
-    lateral[100:130] = 0.2
-    lateral[99] = lateral[130] = 7.0
-    rmse = measured("rmse_after_switch_m", lateral, switching())
-    assert rmse == pytest.approx(0.2, rel=1e-12)
-    lateral[129] = 0.0
-    assert measured("rmse_after_switch_m", lateral, switching()) < 0.2
-    short = np.full(25, 0.2), switching(steps=25, when=15)
-    assert measured("rmse_after_switch_m", *short) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(
@@ -97,9 +72,9 @@ def test_exactly_the_three_seconds_after_a_switch_are_scored_apart():
     [(0, 0.3, True), (0, 0.88, False), (1, -8.0, True), (1, 5.0, False)],
 )
 def test_a_switch_is_a_jump_of_friction_or_wind(channel, to, counts):
-    envs = switching(channel=channel, to=to)
-    rmse = measured("rmse_after_switch_m", np.ones(STEPS), envs)
-    assert np.isnan(rmse) != counts
+    envs = np.array(np.broadcast_to([0.9, 0.0], (STEPS, 2)))
+    envs[100:, channel] = to
+    assert np.flatnonzero(switches(envs)).tolist() == [100] * counts
 
 
 @pytest.mark.parametrize(
@@ -120,26 +95,25 @@ def test_a_state_that_is_not_finite_is_a_departure_whenever_it_happens(when):
 
 
 def batch():
-    """Four constant deviations; all but the first meet a switch of friction."""
-    parts, envs = [], np.repeat(CALM, len(LEVELS), axis=0)
-    for number, level in enumerate(LEVELS):
+    """Four constant deviations."""
+    parts = []
+    for level in LEVELS:
         healthy = np.arange(STEPS) >= round(level * STEPS)
         signals = {"ess": 100.0 * level, "healthy": healthy}
         steering = 0.1 * level * TIME
         parts.append(episode(np.full(STEPS, level), steering=steering, **signals))
-        envs[number, 100:, 0] = 0.3 if number else 0.9
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), envs
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def made(seed=0):
     about = {"system": "sfkd", "scenario": "s3", "seeds": [seed]}
-    return row(score(*batch(), dt=DT), about, (1.5, 2.5), {})
+    return row(score(batch(), dt=DT), about, (1.5, 2.5), {})
 
 
 @pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
 def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
-    joined, envs = batch()
-    values = score(joined, envs, dt=DT)[metric.name]
+    joined = batch()
+    values = score(joined, dt=DT)[metric.name]
     assert values.shape == (len(LEVELS),)
     assert metric.pool
     assert BY_NAME[metric.name] is metric
@@ -147,7 +121,7 @@ def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
         alone = jax.tree.map(lambda leaf, k=k: leaf[k : k + 1], joined)
         parts = {one: getattr(alone, one) for one in ("lateral", "states", "controls")}
         named = {name: alone.signals[name] for name in metric.records}
-        run = Recording(dt=DT, envs=envs[k : k + 1], signals=named, **parts)
+        run = Recording(dt=DT, signals=named, **parts)
         np.testing.assert_array_equal(metric.measure(run), [value])
     for entry in (made(), pool([made(0), made(1)])):
         json.dumps(entry[metric.name], allow_nan=False)
@@ -156,7 +130,7 @@ def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
 @pytest.mark.parametrize("name", EXPECTED)
 def test_a_metric_of_known_episodes_is_exact_and_pools_as_stated(name):
     per_episode, of_row, of_seeds = EXPECTED[name]
-    pooled, values = pool([made(0), made(1)]), score(*batch(), dt=DT)[name]
+    pooled, values = pool([made(0), made(1)]), score(batch(), dt=DT)[name]
     np.testing.assert_allclose(values, per_episode, rtol=1e-12)
     for entry, expected in ((made(), of_row), (pooled, of_seeds)):
         value = BY_NAME[name].value(entry)

@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import any_law, dataset, driven, jit, model_and_params
+from helpers import dataset, driven, jit, model_and_params
 
-from sfkd_jax import build, evaluation, plants
-from sfkd_jax.evaluation._open_loop import FittedBicycle
+from sfkd_jax import evaluation, models, plants
+from sfkd_jax.evaluation import FittedBicycle
 from sfkd_jax.types import Trajectory
 
-DT, HORIZON, STEPS = 0.1, 10, 20
-PLANT = plants.kinematic()
+DT = 0.1
 
 
 def errors_of(name, data, horizon):
@@ -57,12 +56,6 @@ def rolled(step, start, controls):
     return jax.tree.map(lambda leaf: leaf[None], Trajectory(states, controls, envs))
 
 
-def errors(test, **options):
-    options = {"nominal": PLANT.nominal, "dt": DT, "horizon": HORIZON} | options
-    result = evaluation.baselines(dataset().train, **options)
-    return {name: np.asarray(jit(rmse)(test)) for name, rmse in result.items()}
-
-
 @pytest.mark.parametrize(
     ("curvature", "slip", "spread", "is_angle"),
     [
@@ -84,15 +77,22 @@ def test_the_fit_finds_the_parameters_of_a_bicycle(curvature, slip, spread, is_a
 
 
 def test_the_fitted_bicycle_errs_less_than_the_nominal_one():
-    rmse = {name: np.hypot(*e[-1, :2]) for name, e in errors(dataset().test).items()}
-    assert rmse["fitted_bicycle"] < 0.9 * rmse["kinematic_bicycle"]
+    data, horizon = dataset(), 10
+    fitted = models.physics(FittedBicycle.fit(data.train, dt=DT).step)
+    known = models.physics(plants.kinematic().nominal)
+    both = [
+        jit(partial(evaluation.open_loop, each, horizon=horizon))({}, data.test)
+        for each in (fitted, known)
+    ]
+    ours, nominal = (np.hypot(*np.asarray(each)[-1, :2]) for each in both)
+    assert ours < 0.9 * nominal
 
 
-def test_in_path_coordinates_there_is_the_nominal_bicycle_alone():
-    coordinates = jnp.asarray([[0.0, 0.0, 0.0, 0.5, 0.0, 8.0]])
-    states = jnp.tile(coordinates, (STEPS + 1, 1))[None]
-    controls = jnp.tile(jnp.asarray([0.0, 0.0, 0.0, 8.0]), (1, STEPS, 1))
-    data = Trajectory(states, controls, jnp.zeros((1, STEPS, 2)))
-    loop = build.build_loop(PLANT, any_law(3))
-    (result,) = errors(data, nominal=loop.nominal, along_path=True).values()
-    np.testing.assert_array_equal(result[:, 0], np.zeros(HORIZON))
+def test_along_a_path_there_are_errors_beside_it_and_none_along_it():
+    data = Trajectory(*map(jnp.zeros, [(1, 11, 6), (1, 10, 4), (1, 10, 2)]))
+    drift = jnp.asarray([0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
+    model = models.physics(lambda x, u, e: x + drift, along_path=True)
+    errors = jit(partial(evaluation.open_loop, model, horizon=5))({}, data)
+    steps = np.arange(1.0, 6.0)[:, None]
+    expected = steps * np.asarray([0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(errors, expected, rtol=1e-5)

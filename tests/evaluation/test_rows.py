@@ -8,12 +8,12 @@ from sfkd_jax.evaluation.metrics import METRICS
 
 
 def scored(level, count=4):
-    """Scores of episodes that get worse one by one, without any switch of e."""
+    """Scores of episodes that get worse one by one."""
     scores = {metric.name: np.zeros(count) for metric in METRICS if metric.measure}
     worse = level * (1 + 0.1 * np.arange(count))
     for name in ("rmse_m", "rmse_episodes_m", "max_deviation_m"):
         scores[name] = worse
-    return scores | {"rmse_after_switch_m": np.full(count, np.nan)}
+    return scores
 
 
 def made(level, system, *, count=4, violation=None, act_ms=None, **changes):
@@ -36,7 +36,6 @@ def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
     assert measured | given | {"system", "scenario", "seeds"} <= set(entry)
     np.testing.assert_allclose(entry["rmse_m"]["mean"], 0.115)
     np.testing.assert_allclose(entry["max_deviation_m"], 0.13)
-    assert entry["rmse_after_switch_m"] is None
     assert entry["violation"] == {"v0": 0.0}
     assert entry["act_ms"] == {"p50": 1.5, "p99": 2.5}
     assert made(2.0, "sfkd")["act_ms"] is None

@@ -200,7 +200,6 @@ def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
     rows = {entry["system"]: entry for entry in document["rows"]}
     assert set(rows) == {"oracle", "sfkd"}
     assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
-    assert set(rows["sfkd"]["open_loop_rmse_m"]) == {"1", "5", "10", "20"}
     assert len(document["failed"]) == first["failed"] == 3
     assert "row wrong: " in done.stderr
     assert "row two: evaluation.systems must be one system" in done.stderr

@@ -35,7 +35,6 @@ def row(system, env="measured", scenario="s3", vehicle="kinematic", **more):
         "max_deviation_m": 4 * mean, "smoothness_rad_per_s": 0.081, "departures": 0,
         "violation": {"v0": 0.0 if own else None, "v1": 0.1 if own else None},
         "difference_to_sfkd": None if own else {"mean": gap, "ci95": [gap - 1e-3, gap + 1e-3], "p_holm": 0.01},
-        "open_loop_rmse_m": {"1": 0.01, "20": 0.5},
     }  # fmt: skip
     return record | more
 

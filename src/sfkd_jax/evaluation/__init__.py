@@ -4,12 +4,11 @@ from sfkd_jax.evaluation._closed_loop import Episode as Episode
 from sfkd_jax.evaluation._closed_loop import (
     disturbed_environment as disturbed_environment,
 )
-from sfkd_jax.evaluation._closed_loop import first_reference as first_reference
 from sfkd_jax.evaluation._closed_loop import (
     observed_environment as observed_environment,
 )
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
-from sfkd_jax.evaluation._open_loop import baselines as baselines
+from sfkd_jax.evaluation._open_loop import FittedBicycle as FittedBicycle
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores

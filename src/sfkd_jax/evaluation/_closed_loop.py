@@ -115,15 +115,6 @@ def simulate(
     return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
 
 
-def first_reference(
-    scenario: Scenario, *, horizon: int, dt: float
-) -> Float[Array, "horizon 4"]:
-    """Return the reference window at the start of an episode."""
-    return reference_window(
-        scenario.path, jnp.zeros(()), scenario.speed, dt=dt, horizon=horizon
-    )
-
-
 def observed_environment(
     envs: Float[Array, "time 2"],
     key: Key,

@@ -1,11 +1,10 @@
-"""Open-loop prediction errors by horizon, of models and of bicycles."""
+"""Open-loop prediction errors of models by horizon, and a bicycle fitted to data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,15 +20,11 @@ from sfkd_jax.types import (
     Model,
     Params,
     State,
-    Step,
     Trajectory,
 )
 
 STEEP = 1.4
 """Largest steering angle [rad]; larger numbers are no angles."""
-
-Predictor: TypeAlias = Callable[[Trajectory], Float[Array, "horizon state"]]
-"""Window of a trajectory -> its states after the first, predicted."""
 
 
 def open_loop(
@@ -49,26 +44,14 @@ def open_loop(
         trajectories: held out from training.
         horizon: steps.
     """
-    return _prediction_rmse(
-        lambda window: rollout(model, params, window)[0],
-        trajectories,
-        horizon=horizon,
-        along_path=model.along_path,
-    )
-
-
-def _prediction_rmse(
-    predict: Predictor, trajectories: Trajectory, *, horizon: int, along_path: bool
-) -> Float[Array, "horizon 4"]:
-    """The RMSE of any predictor, in the world or along a path."""
     cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
     windows = jax.tree.map(
         lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
     )
 
     def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
-        predicted, true = predict(window), window.states[1:]
-        if not along_path:
+        predicted, true = rollout(model, params, window)[0], window.states[1:]
+        if not model.along_path:
             return state_errors(predicted, true)[:, :4] ** 2
         gap = (predicted - true)[:, BODY]
         # Along a path nothing is predicted of the way along it.
@@ -140,41 +123,3 @@ class FittedBicycle:
         course = state[2] + 0.5 * turned + b[0] + b[1] * curvature
         x, y = length * jnp.cos(course), length * jnp.sin(course)
         return state.at[:4].add(jnp.stack([x, y, turned, change]))
-
-
-def baselines(
-    train: Trajectory,
-    *,
-    nominal: Step,
-    dt: float,
-    horizon: int,
-    along_path: bool = False,
-) -> dict[str, Callable[[Trajectory], Float[Array, "horizon 4"]]]:
-    """Return bicycles as trajectories -> RMSE on the windows of `open_loop`, by name.
-
-    Args:
-        train: for the fit.
-        nominal: step of the kinematic bicycle on these states and controls.
-        dt: sampling period [s].
-        horizon: steps.
-        along_path: whether states are those of path coordinates.
-    """
-    steps = {"kinematic_bicycle": nominal}
-    # Controls along a path are perturbations of a law: no bicycle explains them.
-    if not along_path:
-        steps["fitted_bicycle"] = FittedBicycle.fit(train, dt=dt).step
-    common: dict[str, Any] = {"horizon": horizon, "along_path": along_path}
-    return {
-        name: partial(_prediction_rmse, partial(_simulate, step), **common)
-        for name, step in steps.items()
-    }
-
-
-def _simulate(step: Step, window: Trajectory) -> Float[Array, "horizon state"]:
-    """States of a step function from the first state of a window on."""
-
-    def advance(state: State, given: tuple[Control, Environment]) -> tuple[Any, Any]:
-        after = step(state, *given)
-        return after, after
-
-    return jax.lax.scan(advance, window.states[0], (window.controls, window.envs))[1]

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from sfkd_jax.evaluation._closed_loop import Episode
 from sfkd_jax.evaluation._statistics import holm, paired_difference
@@ -30,13 +29,10 @@ Scores: TypeAlias = dict[str, PerEpisode]
 """Numbers per episode by the name of their metric."""
 
 
-def score(
-    episodes: Episode, envs: Float[np.ndarray, "episode time 2"], *, dt: float
-) -> Scores:
-    """Measure every metric on a batch of episodes in the true environments."""
+def score(episodes: Episode, *, dt: float) -> Scores:
+    """Measure every metric on a batch of episodes."""
     recording = Recording(
         dt=dt,
-        envs=np.asarray(envs),
         lateral=np.asarray(episodes.lateral, dtype=np.float64),
         states=np.asarray(episodes.states),
         controls=np.asarray(episodes.controls),

@@ -34,8 +34,6 @@ PerEpisode: TypeAlias = Float[np.ndarray, " episode"] | Bool[np.ndarray, " episo
 
 SETTLING = 2.0
 """Start of an episode, not scored because it is the same for every system [s]."""
-AFTER_SWITCH = 3.0
-"""Time after a switch of e that `rmse_after_switch_m` covers [s]."""
 LANE_HALF_WIDTH = 1.75
 """[m]"""
 VEHICLE_HALF_WIDTH = 0.9
@@ -47,10 +45,9 @@ SWITCH = (0.05, 6.0)
 
 
 class Recording(NamedTuple):
-    """What metrics measure: fields of `Episode` as arrays, and the true e."""
+    """What metrics measure: fields of `Episode` as arrays."""
 
     dt: float
-    envs: Float[np.ndarray, "episode time environment"]
     lateral: Float[np.ndarray, "episode time"]
     states: Float[np.ndarray, "episode time_plus_1 state"]
     controls: Float[np.ndarray, "episode time control"]
@@ -64,8 +61,8 @@ class Metric(NamedTuple):
         name: JSON key; `a.b` is the entry b of the record a.
         label: what a reader sees.
         unit: of the value as shown.
-        table: which table shows it: "tracking", "spread", "planner", "cost", "claims"
-            or "prediction"; "" for none.
+        table: which table shows it: "tracking", "spread", "planner", "cost" or
+            "claims"; "" for none.
         write: formats a JSON value; an en dash for None and for what is not finite.
         measure: one number per episode; None if the value is not about one episode.
         pool: the JSON value of a row from the numbers of its episodes.
@@ -118,19 +115,6 @@ def switches(
     return np.concatenate([np.zeros_like(jumps[..., :1]), jumps], axis=-1)
 
 
-def _rmse_after_switch(run: Recording) -> np.ndarray:
-    """RMSE within AFTER_SWITCH of a switch; NaN for an episode without a switch."""
-    jumps = switches(run.envs)
-    after = np.zeros_like(jumps)
-    for lag in range(min(round(AFTER_SWITCH / run.dt), jumps.shape[1])):
-        after[:, lag:] |= jumps[:, : jumps.shape[1] - lag]
-    # A switch during settling is scored from the end of settling on.
-    after[:, : round(SETTLING / run.dt)] = False
-    squares = np.where(after, run.lateral**2, 0.0).sum(axis=1)
-    counts = after.sum(axis=1)
-    return np.where(counts > 0, np.sqrt(squares / np.maximum(counts, 1)), np.nan)
-
-
 def _steering_rate(run: Recording) -> np.ndarray:
     """Mean |steering rate| of the applied controls."""
     return np.mean(np.abs(np.diff(run.controls[..., 0], axis=1)), axis=1) / run.dt
@@ -147,11 +131,6 @@ def _departed(run: Recording) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values))
-
-
-def _mean_known(values: np.ndarray) -> float | None:
-    """The mean of the episodes that have the measure."""
-    return None if np.all(np.isnan(values)) else float(np.nanmean(values))
 
 
 def _median(values: np.ndarray) -> float | None:
@@ -189,8 +168,6 @@ METRICS: tuple[Metric, ...] = (
            lambda values: float(np.max(values)),
            lambda rows: float(np.max(as_numbers(
                [row["max_deviation_m"] for row in rows])))),
-    Metric("rmse_after_switch_m", "RMSE after a switch", "mm", "spread", millimetres,
-           _rmse_after_switch, _mean_known),
     Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",
            measure=_steering_rate, pool=_mean),
     Metric("violation.v0", "V0, theorem", "%", "claims", percent),
@@ -212,9 +189,6 @@ METRICS: tuple[Metric, ...] = (
            partial(interval, **_MM)),
     Metric("params", "Parameters", "", "cost", short),
     Metric("alpha", "Certified α", "", "cost", upper),
-    Metric("open_loop_rmse_m.1", "1 step ahead", "m", "prediction"),
-    *(Metric(f"open_loop_rmse_m.{steps}", f"{steps} steps ahead", "m", "prediction")
-      for steps in (5, 10, 20)),
 )
 """All metrics, in the order of the columns of tables."""
 # fmt: on

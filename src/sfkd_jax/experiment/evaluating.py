@@ -22,13 +22,12 @@ from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import check_step
 from sfkd_jax.rollout import fold, unfold
-from sfkd_jax.scenarios import Scenario
+from sfkd_jax.scenarios import Scenario, reference_window
 from sfkd_jax.settings import arguments, choose, plain
 from sfkd_jax.types import Key, Params, Scalar, Trajectory
 
 WARM_UP = 10
 """Control steps before timing starts."""
-OPEN_LOOP_STEPS = (1, 5, 10, 20)
 
 
 class EpisodeSet(NamedTuple):
@@ -144,12 +143,12 @@ class SystemEvaluation:
     def __init__(
         self, settings: Settings, name: str, system: System, dataset: Dataset | None
     ) -> None:
-        """Build the controller; the test part of a data set gives open-loop errors."""
+        """Build the controller; of logs the box of e is that of the data set."""
         self._settings = settings
         self._plant = plant = build.build_vehicle(settings.vehicle)
         self._times: tuple[float, float] | None = None
         box: Any = settings.environment.box
-        # Of logs the box is measured: their settings have none.
+        # Their settings have none.
         if dataset is not None:
             box = dict(zip(box, (dataset.env_low, dataset.env_high), strict=True))
         self.controller = build.build_controller(
@@ -165,7 +164,6 @@ class SystemEvaluation:
         self.params = jax.jit(partial(fold, system.model))(system.params)
         self._system = system._replace(params=self.params)
         self._columns = _columns(settings, name, system)
-        self._columns["open_loop_rmse_m"] = dataset and self._open_loop_rmse(dataset)
         self._claims = _claims(settings, system)
         simulate = partial(
             evaluation.simulate,
@@ -213,20 +211,23 @@ class SystemEvaluation:
             envs = jax.jit(jax.vmap(disturb))(known.envs, episodes.keys)
             driven = known._replace(envs=envs)
         episode = self._simulate(driven, episodes.keys)
-        # Scored against e without the force, which no model knows.
-        scores = evaluation.score(episode, np.asarray(known.envs), dt=self._plant.dt)
+        scores = evaluation.score(episode, dt=self._plant.dt)
         violation = dict.fromkeys(("v0", "v1"))
         # A prediction needs as many steps as a segment of the data set has.
         long = episode.controls.shape[1] >= self._settings.dataset.steps
-        if long and self._claims is not None:
+        if long and self._claims:
             seen = Trajectory(episode.states, episode.controls, episode.assumed_envs)
-            shares = self._violated(self.params, seen, known)
+            shares = self._violated(self.params, seen, known, self._claims)
             for name, share in jax.device_get(shares).items():
                 violation[name] = float(share) if np.isfinite(share) else None
         return episode, scores, violation
 
     def _violations(
-        self, params: Params, seen: Trajectory, scenarios: Scenario
+        self,
+        params: Params,
+        seen: Trajectory,
+        scenarios: Scenario,
+        claims: evaluation.ClaimedBounds,
     ) -> dict[str, Scalar]:
         """Violations of claims along episodes, in the coordinates of the model."""
 
@@ -240,24 +241,19 @@ class SystemEvaluation:
             self._system.model,
             params,
             jax.vmap(convert)(seen, scenarios),
-            self._claims,
+            claims,
             length=self._settings.dataset.steps,
         )
-
-    def _open_loop_rmse(self, dataset: Dataset) -> dict[str, float]:
-        """Position RMSE of predictions on the test part, by steps ahead [m]."""
-        horizon = self._settings.certification.horizon
-        predict = partial(evaluation.open_loop, self._system.model, horizon=horizon)
-        errors = jax.jit(predict)(self.params, dataset.test)
-        distance = np.hypot(*np.asarray(errors, dtype=np.float64).T[:2])
-        steps = [step for step in OPEN_LOOP_STEPS if step <= horizon]
-        return {str(step): float(distance[step - 1]) for step in steps}
 
     def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float]:
         """Median and 99 % quantile of a compiled control step [ms]."""
         scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
-        reference = evaluation.first_reference(
-            scenario, horizon=self._settings.controller.horizon, dt=self._plant.dt
+        reference = reference_window(
+            scenario.path,
+            jnp.zeros(()),
+            scenario.speed,
+            dt=self._plant.dt,
+            horizon=self._settings.controller.horizon,
         )
         observed = (scenario.initial_state, scenario.envs[0], reference)
         act = jax.jit(self.controller.act)

@@ -23,9 +23,10 @@ from sfkd_jax.data import (
     random_windows,
     spread_windows,
 )
-from sfkd_jax.evaluation import baselines, open_loop
+from sfkd_jax.evaluation import FittedBicycle, open_loop
 from sfkd_jax.experiment import data, runs
 from sfkd_jax.experiment.options import Settings
+from sfkd_jax.models import physics
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
@@ -172,13 +173,19 @@ def _open_loop_document(
     plant = (
         data.closed_loop(settings) if along else build.build_vehicle(settings.vehicle)
     )
-    about: Any = {"dt": plant.dt, "horizon": horizon, "along_path": along}
-    bicycles = baselines(dataset.train, nominal=plant.nominal, **about)
+    bicycles = {"kinematic_bicycle": plant.nominal}
+    # Controls along a path are perturbations of a law: no bicycle explains them.
+    if not along:
+        bicycles["fitted_bicycle"] = FittedBicycle.fit(dataset.train, dt=plant.dt).step
+    others = {name: physics(step, along_path=along) for name, step in bicycles.items()}
 
     @jax.jit
     def errors(params: Params, test: Trajectory) -> tuple[jax.Array, dict[str, Any]]:
         own = open_loop(model, fold(model, params), test, horizon=horizon)
-        return own, {name: predict(test) for name, predict in bicycles.items()}
+        return own, {
+            name: open_loop(one, {}, test, horizon=horizon)
+            for name, one in others.items()
+        }
 
     def columns(errors: jax.Array) -> dict[str, list[float]]:
         """Errors by coordinate as lists over the steps ahead."""
@@ -191,13 +198,13 @@ def _open_loop_document(
             "speed_rmse_m_per_s": speed.tolist(),
         }
 
-    own, others = errors(params, dataset.test)
+    own, of_bicycles = errors(params, dataset.test)
     return {
         "steps": list(range(1, horizon + 1)),
         "dt": plant.dt,
         "trajectories": dataset.test.controls.shape[0],
         **columns(own),
-        "baselines": {name: columns(one) for name, one in others.items()},
+        "baselines": {name: columns(one) for name, one in of_bicycles.items()},
     }
 
 
