@@ -79,9 +79,9 @@ FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 
 LINES = {"src": 24_870, "tests": 15_320, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
-FILES_IN_SRC = 128
+FILES_IN_SRC = 129
 
-OPTIONS, EXPERIMENTS = 65, 10
+OPTIONS, EXPERIMENTS = 66, 10
 COMMITTED = {"*.json": 685_000, "figures": 2_600_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""

@@ -267,7 +267,11 @@ class ControllerInfo(TypedDict, total=False):
     bound_exceeded: Bool[Array, ""]  # nominal_distance exceeds the certified bound
     outside_box: Bool[Array, ""]  # outside the boxes of the certificate
     braking: Bool[Array, ""]  # the planner brakes beyond the class
-    shield_healthy: Bool[Array, ""]  # feasible, and the certificate applies
+    rolling: Scalar  # part of the corridor from below its slowest speed [m]
+    shield_healthy: Bool[Array, ""]  # there is a corridor
+    # a course with obstacles
+    clearance: Scalar  # claimed distance from obstacles [m]; NaN where none is
+    gap: Scalar  # their true distance, as a simulation knows it [m]
 
 
 class Controller(NamedTuple):

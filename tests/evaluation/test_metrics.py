@@ -26,10 +26,14 @@ EXPECTED = {
     "departures": ((False, False, False, True), 1, 2),
     "unhealthy_steps": ((0.1, 0.2, 0.6, 0.9), 0.45, 0.45),
     "ess": ((10.0, 20.0, 60.0, 90.0), 40.0, 40.0),
+    "collisions": ((0, 0, 0, 1), 1, 2),
+    "clearance_m": ((0.8, 0.7, 0.3, -0.05), -0.05, -0.05),
+    "below_claim": ((0, 0, 100, 100), 200, 400),
+    "mean_speed_mps": ((0.0, 0.0, 0.0, 0.0), 0.0, 0.0),
 }
 
 
-def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True):
+def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True, near=np.inf):
     """One episode as a batch, with what matters given and the rest at rest."""
     steps = len(lateral)
     controls = np.zeros((1, steps, 2))
@@ -43,6 +47,8 @@ def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True):
         signals={
             "effective_samples": np.full((1, steps), ess),
             "healthy": np.full((1, steps), healthy),
+            "gap": np.full((1, steps), near),
+            "clearance": np.full((1, steps), 0.5) * np.where(near == np.inf, np.nan, 1),
         },
     )
 
@@ -100,6 +106,7 @@ def batch():
     for level in LEVELS:
         healthy = np.arange(STEPS) >= round(level * STEPS)
         signals = {"ess": 100.0 * level, "healthy": healthy}
+        signals["near"] = np.where(TIME > 10.0, (0.9 - level, -0.05)[level > 0.8], 2.0)
         steering = 0.1 * level * TIME
         parts.append(episode(np.full(STEPS, level), steering=steering, **signals))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

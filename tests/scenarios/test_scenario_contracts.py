@@ -9,6 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, jit, same
 
 from sfkd_jax import scenarios
+from sfkd_jax.lanes import circles
 
 EVERY = tuple(scenarios.ROADS)
 KEYS = jax.random.split(jax.random.key(7), 32)
@@ -37,7 +38,8 @@ def test_a_batch_of_episodes_is_finite_starts_on_its_paths_and_stays_in_the_box(
     episodes = batch(name)
     leaves = jax.tree.leaves(episodes)
     assert all(isinstance(leaf, jax.Array) for leaf in leaves)
-    assert all(leaf.dtype == jnp.float32 and leaf.shape[0] == 32 for leaf in leaves)
+    assert {leaf.dtype.name for leaf in leaves} <= {"float32", "bool"}
+    assert {leaf.shape[0] for leaf in leaves} == {32}
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves)
     assert episodes.envs.shape == episodes.observed_envs.shape == (32, STEPS, 2)
     start = np.tile(np.float32([0.0, 0.0, 0.0, 9.0]), (32, 1))
@@ -79,3 +81,36 @@ def test_a_lane_change_ends_in_the_other_lane_and_comes_back():
         assert np.abs(yaw[apart]).max() < 0.08
         assert np.mean(np.abs(lateral) < 0.05) > 0.4
     assert {np.sign(one[np.abs(one).argmax()]) for one in offset} == {-1.0, 1.0}
+
+
+def test_obstacles_stand_as_far_apart_as_asked_and_are_seen_when_the_car_is_near():
+    family = scenarios.scenario(name="obstacles", duration=60.0, state_size=4, dt=DT)
+    made = jit(family)(KEYS[0])
+    course, every = made.course, np.asarray(made.course.obstacles.position)[:, 0]
+    along, present = np.asarray(course.along), np.asarray(course.obstacles.present)
+    assert np.all((np.diff(along) >= 40.0) & (np.diff(along) <= 60.0))
+    # All that are met in 60 s at 10 m/s are there.
+    assert along[0] >= 70.0
+    assert present[along < 600.0].all()
+    foot, aside = jit(jax.vmap(scenarios.project, in_axes=(None, 0, 0)))(
+        made.path, every, course.along
+    )
+    np.testing.assert_allclose(foot[present], along[present], atol=0.05)
+    assert 0.5 < np.abs(aside).max() <= 1.501
+    see = jit(scenarios.in_view)
+    for progress in (0.0, 10.0, 200.0, along[2], along[-1]):
+        shown = see(course, progress)
+        seen = np.asarray(shown.position)[np.asarray(shown.present)][:, 0]
+        ahead = along - progress
+        near = every[present & (ahead > 0) & (ahead <= 60.0)]
+        assert {*map(tuple, near)} <= {*map(tuple, seen)}
+        assert not {*map(tuple, every[ahead > 60.0])} & {*map(tuple, seen)}
+
+
+def test_the_clearance_of_a_car_is_that_of_its_box():
+    obstacles = circles(jnp.asarray([[5.0, 0.0]]), 0.8)
+    near = jit(scenarios.car_clearance)
+    ahead, across = jnp.zeros(4), jnp.asarray([0.0, 0.0, np.pi / 2, 9.0])
+    assert near(obstacles, ahead) == pytest.approx(5.0 - 2.25 - 0.8, abs=1e-4)
+    assert near(obstacles, across) == pytest.approx(5.0 - 1.0 - 0.8, abs=1e-4)
+    assert near(obstacles, ahead.at[:2].set(jnp.asarray([4.0, 0.5]))) < 0.0

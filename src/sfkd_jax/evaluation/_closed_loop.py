@@ -11,9 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
+from sfkd_jax.geometry import LATERAL, curvature_ahead, path_coordinates
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
-from sfkd_jax.scenarios import Scenario, project, random_side_forces, reference_window
+from sfkd_jax.scenarios import (
+    Scenario,
+    car_clearance,
+    in_view,
+    project,
+    random_side_forces,
+    reference_window,
+)
 from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
 
 FORCE_STREAM = 2
@@ -30,7 +38,8 @@ class Episode(NamedTuple):
     Attributes:
         states: x_0 … x_T (time + 1, state).
         controls: applied (time, control).
-        lateral: signed distance of x_1 … x_T from the path [m], (time,).
+        lateral: signed distance of x_1 … x_T from the path [m], or from the reference
+            that a controller of scenes follows, (time,).
         progress: arc length reached [m], (time,).
         assumed_envs: e that the controller planned with, observed or estimated,
             (time, environment).
@@ -64,6 +73,11 @@ def simulate(
     Two systems given the same scenario and key follow the same path in the same
     environment, with the same sensor noise and sampling keys.
 
+    On a course the controller is given the scene, lane and obstacles in view, in place
+    of a reference. Two signals tell how near the car comes: `gap`, its true distance
+    from the nearest obstacle [m], and `clearance`, what the controller claimed of it;
+    NaN where there is none.
+
     Args:
         plant: the true step.
         controller: of the car.
@@ -91,11 +105,9 @@ def simulate(
         env, observed_env, sensor_key = inputs
         # Noise reaches the controller, never the truth or the scores.
         observation = state + spread * jax.random.normal(sensor_key, state.shape)
-        reference = reference_window(
-            scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
-        )
+        ahead = _ahead(scenario, progress, dt=dt, horizon=horizon)
         control, memory, info = controller.act(
-            params, memory, observation, observed_env, reference
+            params, memory, observation, observed_env, ahead
         )
         # The plant is in e, whatever the controller observed of it.
         state = plant(state, control, env)
@@ -103,6 +115,13 @@ def simulate(
         progress, lateral = project(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
+        if scenario.course is not None:
+            info["gap"] = car_clearance(ahead[1], state)
+            if "reference" in info:
+                # Where the reference is one step later.
+                follows = info["reference"]
+                bend = curvature_ahead(follows)[0]
+                lateral = path_coordinates(state, follows[0], bend)[LATERAL]
         # An estimator reports what it planned with; others plan with what they see.
         assumed = info.get("env_estimate", observed_env)
         signals = {name: signal(info) for name, signal in wanted.items()}
@@ -113,6 +132,15 @@ def simulate(
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
     return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
+
+
+def _ahead(scenario: Scenario, progress: Scalar, *, dt: float, horizon: int) -> Any:
+    """What a controller is given to drive by."""
+    if scenario.course is not None:
+        return scenario.course.lane, in_view(scenario.course, progress)
+    return reference_window(
+        scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
+    )
 
 
 def observed_environment(

@@ -6,6 +6,7 @@ had so far: `simulate` records what the entries name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -129,6 +130,35 @@ def _departed(run: Recording) -> np.ndarray:
     return ~finite | ~stays
 
 
+def _nearest(run: Recording) -> np.ndarray:
+    """Smallest true distance from an obstacle; NaN where there is none."""
+    nearest = np.min(run.signals["gap"], axis=1)
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def _below_claim(run: Recording) -> np.ndarray:
+    """Number of steps nearer to an obstacle than was claimed; NaN without a claim."""
+    gap, claim = run.signals["gap"], run.signals["clearance"]
+    below = np.sum(gap < claim, axis=1)
+    return np.where(np.all(np.isnan(claim), axis=1), np.nan, below)
+
+
+def _known(combine: Callable[[Any], Any], values: np.ndarray) -> Any:
+    """A sum, mean or extreme of the episodes that have the measure."""
+    found = values[~np.isnan(values)]
+    return combine(found).item() if len(found) else None
+
+
+def _whole(values: np.ndarray) -> Any:
+    return np.sum(values).astype(int)
+
+
+def _of_rows(name: str, combine: Callable[[list[Any]], Any], rows: list[Row]) -> Any:
+    """The same over trainings; None where one has no value."""
+    values = [row[name] for row in rows]
+    return None if None in values else combine(values)
+
+
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values))
 
@@ -151,6 +181,7 @@ def _of_trainings(rows: list[Row]) -> list[list[float]]:
 _MM: dict[str, Any] = {"digits": 1, "scale": 1e3}
 """How lateral errors, in files in m, are written."""
 _TWO = partial(number, digits=2)
+_GAP: dict[str, Signal] = {"gap": lambda info: info.get("gap", math.nan)}
 
 # fmt: off
 METRICS: tuple[Metric, ...] = (
@@ -181,6 +212,17 @@ METRICS: tuple[Metric, ...] = (
     Metric("ess", "Effective samples", "", "planner", partial(number, digits=0),
            lambda run: np.median(run.signals["effective_samples"], axis=1), _median,
            records={"effective_samples": lambda info: info["effective_samples"]}),
+    Metric("collisions", "Episodes with a collision", "", "claims", short,
+           lambda run: 1.0 * (_nearest(run) < 0.0) + 0.0 * _nearest(run),
+           partial(_known, _whole), partial(_of_rows, "collisions", sum), _GAP),
+    Metric("clearance_m", "Smallest clearance", "m", "claims", _TWO, _nearest,
+           partial(_known, np.min), partial(_of_rows, "clearance_m", min), _GAP),
+    Metric("below_claim", "Steps below the claimed clearance", "", "claims", short,
+           _below_claim, partial(_known, _whole), partial(_of_rows, "below_claim", sum),
+           _GAP | {"clearance": lambda info: info.get("clearance", math.nan)}),
+    Metric("mean_speed_mps", "Mean speed", "m/s", "spread", _TWO,
+           lambda run: np.mean(run.states[:, 1:, 3], axis=1) + 0.0 * _nearest(run),
+           partial(_known, np.mean), records=_GAP),
     Metric("act_ms.p50", "Control step, median", "ms", "cost", _TWO),
     Metric("act_ms.p99", "Control step, 99 %", "ms", "cost", _TWO),
     Metric("ratio_to_oracle", "RMSE over oracle", "", "tracking", _TWO),

@@ -14,6 +14,12 @@ from sfkd_jax.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
+from sfkd_jax.scenarios._obstacles import CAR as CAR
+from sfkd_jax.scenarios._obstacles import Course as Course
+from sfkd_jax.scenarios._obstacles import beside as beside
+from sfkd_jax.scenarios._obstacles import car_clearance as car_clearance
+from sfkd_jax.scenarios._obstacles import in_view as in_view
+from sfkd_jax.scenarios._obstacles import random_course as random_course
 from sfkd_jax.scenarios._paths import smooth_path as smooth_path
 from sfkd_jax.scenarios._scenarios import ROADS as ROADS
 from sfkd_jax.scenarios._scenarios import Family as Family

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -16,6 +17,7 @@ from sfkd_jax.scenarios._conditions import (
     uniform_road,
     wet_road,
 )
+from sfkd_jax.scenarios._obstacles import Course, random_course
 from sfkd_jax.scenarios._paths import double_lane_change, smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
@@ -29,6 +31,7 @@ class Scenario(NamedTuple):
         observed_envs: the same as the controller observes it, (time, 2).
         path: to follow.
         speed: to hold [m/s].
+        course: obstacles on the path, or None: the path is to be followed.
     """
 
     initial_state: State
@@ -36,6 +39,7 @@ class Scenario(NamedTuple):
     observed_envs: Schedule
     path: Path
     speed: Scalar
+    course: Course | None = None
 
 
 Family: TypeAlias = Callable[[Key], Scenario]
@@ -48,10 +52,13 @@ class Road(NamedTuple):
         conditions: (key, steps, sampling period [s]) -> e_0 … e_{T-1}.
         path: (key, length [m]) -> path from the origin along x; None for `smooth_path`
             with the curvature and the wavelengths of the settings.
+        course: (key, path, speed=v [m/s]) -> obstacles on the path; None for a road
+            that is free.
     """
 
     conditions: Callable[[Key, int, float], Schedule]
     path: Callable[[Key, float], Path] | None = None
+    course: Callable[..., Course] | None = None
 
 
 ROADS: dict[str, Road] = {
@@ -65,11 +72,16 @@ ROADS: dict[str, Road] = {
         ),
         double_lane_change,
     ),
+    "obstacles": Road(
+        lambda key, steps, dt: switching_road(key, steps=steps, dt=dt),
+        course=random_course,
+    ),
 }
 """Scenarios by name; an entry is all that a new one needs.
 
 "s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road.
 "double_lane_change" has a path of its own, friction from wet to dry and no wind.
+"obstacles" is S3 with a `random_course`.
 """
 
 
@@ -112,24 +124,30 @@ def scenario(
     def conditions(key: Key) -> Schedule:
         return road.conditions(key, steps, dt)
 
-    return family(conditions, path, speed=speed, state_size=state_size)
+    course = road.course and partial(road.course, speed=speed)
+    return family(conditions, path, course, speed=speed, state_size=state_size)
 
 
 def family(
     conditions: Callable[[Key], Schedule],
     paths: Callable[[Key], Path],
+    courses: Callable[[Key, Path], Course] | None = None,
     *,
     speed: float,
     state_size: int,
 ) -> Family:
-    """Combine a schedule of conditions and paths from the origin along x."""
+    """Combine conditions, paths from the origin along x, and obstacles on them."""
 
     def sample(key: Key) -> Scenario:
+        course_key = key
+        if courses is not None:
+            key, course_key = jax.random.split(key)
         # A key each: other conditions leave the path of an episode as it is.
         path_key, condition_key = jax.random.split(key)
         start = jnp.zeros(state_size).at[3].set(speed)
-        envs = conditions(condition_key)
+        envs, path = conditions(condition_key), paths(path_key)
+        course = courses and courses(course_key, path)
         # The controller observes the truth; a measurement error replaces this field.
-        return Scenario(start, envs, envs, paths(path_key), jnp.asarray(speed))
+        return Scenario(start, envs, envs, path, jnp.asarray(speed), course)
 
     return sample

@@ -1,0 +1,116 @@
+"""Roads with obstacles that are seen late: random courses, and what is seen of them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.lanes import Lane, Obstacles, circles, lane_along, outside_box
+from sfkd_jax.paths import SPACING, Path, point_at
+from sfkd_jax.types import Key, Scalar, State
+
+FIRST = 70.0
+"""Arc length of the first obstacle at the earliest [m]: out of sight at the start."""
+PASSED = 15.0
+"""Distance behind the car at which an obstacle is out of its way [m]."""
+CAR = (2.25, 1.0)
+"""Half of length and width of the car [m]."""
+IN_VIEW = 4
+"""Most obstacles that a controller is shown, the ones that are passed next."""
+
+
+class Course(NamedTuple):
+    """A lane with obstacles, each of which is seen from a distance on.
+
+    Attributes:
+        lane: with its path.
+        obstacles: all of them, in the order in which they are passed.
+        along: arc length of the path beside each [m], rising, (obstacle,).
+        view: distance along the path from which each is seen [m], (obstacle,).
+    """
+
+    lane: Lane
+    obstacles: Obstacles
+    along: Float[Array, " obstacle"]
+    view: Float[Array, " obstacle"]
+
+
+def random_course(
+    key: Key,
+    path: Path,
+    *,
+    gap: tuple[float, float] = (40.0, 60.0),
+    offset: float = 1.5,
+    radius: float = 0.8,
+    view: float = 60.0,
+    width: float = 10.5,
+    speed: float = 10.0,
+) -> Course:
+    """Draw obstacles that stand beside or on the centre line of a path.
+
+    The lane is as wide as three, so that the car may pass each of them on either side.
+
+    Args:
+        key: consumed.
+        path: open; its last 50 m stay free.
+        gap: range of the distance from one obstacle to the next [m].
+        offset: largest, to the left or right [m].
+        radius: of each [m].
+        view: distance from which each is seen [m].
+        width: of the lane [m].
+        speed: wanted [m/s].
+    """
+    gap_key, offset_key = jax.random.split(key)
+    length = (path.points.shape[0] - 1) * SPACING
+    # As many as the shortest gaps need, and no less than are shown at once.
+    count = max(int((length - FIRST) / gap[0]), IN_VIEW)
+    gaps = jax.random.uniform(gap_key, (count,), minval=gap[0], maxval=gap[1])
+    along = FIRST - gap[0] + jnp.cumsum(gaps)
+    aside = jax.random.uniform(offset_key, (count,), minval=-offset, maxval=offset)
+    obstacles = circles(beside(path, along, aside), radius)
+    obstacles = obstacles._replace(present=along <= path.length - 50.0)
+    lane = lane_along(path, width=width, speed=speed)
+    return Course(lane, obstacles, along, jnp.full(count, view))
+
+
+def beside(
+    path: Path, along: Float[Array, " place"], aside: Float[Array, " place"]
+) -> Float[Array, "place 2"]:
+    """Return positions at arc lengths and distances to the left of a path [m]."""
+    point = jax.vmap(point_at, in_axes=(None, 0))(path, along)
+    normal = jnp.stack([-jnp.sin(point[:, 2]), jnp.cos(point[:, 2])], axis=1)
+    return point[:, :2] + aside[:, None] * normal
+
+
+def in_view(course: Course, progress: Scalar) -> Obstacles:
+    """Return what a car sees: of the obstacles to pass, the next `IN_VIEW`.
+
+    Args:
+        course: with at least as many obstacles, present or not.
+        progress: arc length of the car [m].
+    """
+    ahead = course.along - progress
+    last = course.along.shape[0] - IN_VIEW
+    first = jnp.clip(jnp.sum(ahead < -PASSED), 0, last)
+    present = course.obstacles.present & (ahead <= course.view)
+    seen = course.obstacles._replace(present=present)
+    # A window of constant size: a controller is compiled once for all courses.
+    return jax.tree.map(
+        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, IN_VIEW), seen
+    )
+
+
+def car_clearance(obstacles: Obstacles, state: State) -> Scalar:
+    """Return how far a car is from the nearest circle [m], negative inside.
+
+    Args:
+        obstacles: circles, where they are now.
+        state: of the car, whose position is the middle of a box of `CAR`.
+    """
+    count = obstacles.radius.shape[0]
+    yaw, half = jnp.full(count, state[2]), jnp.tile(jnp.asarray(CAR), (count, 1))
+    apart = outside_box(obstacles.at(0.0) - state[:2], yaw, half) - obstacles.radius
+    return jnp.min(jnp.where(obstacles.present, apart, jnp.inf))
