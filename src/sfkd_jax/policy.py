@@ -142,6 +142,15 @@ class Policy(TrainedModel):
         dwell = "{:g} to {:g} s".format(*under["dwell_s"])
         yield f"under: {told}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
 
+    def _with_corridor(self) -> dict[str, Any]:
+        """Return the certificate; a ValueError says that it has no corridor."""
+        if not (self.certificate and self.certificate.get("corridor")):
+            raise ValueError(
+                "this policy has no certified corridor to keep a planner in: load one "
+                "in path coordinates with its certificate, as pretrained/dynamic_path"
+            )
+        return self.certificate
+
     def guard(self, planner: Controller, *, along_path: bool = False) -> Controller:
         """Return any planner behind the shield of this policy, to be called like it.
 
@@ -152,15 +161,38 @@ class Policy(TrainedModel):
             along_path: whether it takes ξ and a preview instead of observation and
                 reference, see `control.along_reference`.
         """
-        if not (self.certificate and self.certificate.get("corridor")):
-            raise ValueError(
-                "this policy has no certified corridor to keep a planner in: load one "
-                "in path coordinates with its certificate, as pretrained/dynamic_path"
-            )
+        self._with_corridor()
         # Its settings are numbers, also where a program is traced when it is built.
         with jax.ensure_compile_time_eval():
             guard = self.around(planner=planner if along_path else REQUEST)
         return _entrance(guard if along_path else behind(guard, planner), self)
+
+    def in_lane(
+        self, *, car: tuple[float, float] = (4.5, 1.8), planner: str = "mppi"
+    ) -> Controller:
+        """Return a controller that drives in a lane, round obstacles, see `InLane`.
+
+        Its `act` takes (`Lane`, `Obstacles`) in place of the reference.
+
+        Args:
+            car: length and width [m]; its middle is the observed position.
+            planner: that searches for a reference, "mppi" or "cem".
+        """
+        certificate = self._with_corridor()
+        names = self.interface["environment"]["names"]
+        friction = [i for i, name in enumerate(names) if name.startswith("friction")]
+        with jax.ensure_compile_time_eval():
+            controller = build.build_in_lane(
+                self.controller,
+                self.vehicle,
+                self.law,
+                certificate,
+                horizon=self.interface["horizon"],
+                car=car,
+                planner=planner,
+                friction=friction[0] if friction else None,
+            )
+        return Controller(_numerics()(controller.init), _numerics()(controller.act))
 
     def __reduce__(self) -> Any:
         """Refuse to be pickled; functions of a closure say less clearly why."""

@@ -20,6 +20,7 @@ from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
 from sfkd_jax.build._controllers import ControllerSettings as ControllerSettings
 from sfkd_jax.build._controllers import build_controller as build_controller
+from sfkd_jax.build._controllers import build_in_lane as build_in_lane
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
 from sfkd_jax.data import Driver

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from sfkd_jax import control, plants
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED
+from sfkd_jax.geometry import (
+    CURVATURE,
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    REFERENCE_SPEED,
+)
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller, Model
@@ -27,6 +34,14 @@ ALLOWANCE = 3.0
 """Standard deviations of a measured position by which the tube is enlarged."""
 Corner = Sequence[float] | None
 """Lower or upper ends of the environment box E, if they are known."""
+
+
+SEARCH = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
+"""Of a planner of references."""
+SEARCHES: dict[str, Any] = {
+    "mppi": {"num_samples": 300, "effective_samples": 5.0},
+    "cem": {"num_samples": 100, "iterations": 3, "elites": 10},
+}
 
 
 PLANNERS: dict[str, Callable[..., Controller]] = {
@@ -342,6 +357,58 @@ def _test(certificate: Mapping[str, Any] | None) -> control.InnovationTest | Non
     """The test of a certificate; None for one without: it was made before there was."""
     entry = ((certificate or {}).get("corridor") or {}).get("innovations")
     return entry and control.innovation_test(entry)
+
+
+def build_in_lane(
+    inner: Controller,
+    plant: plants.Vehicle,
+    law: control.PathLaw,
+    certificate: Mapping[str, Any],
+    *,
+    horizon: int,
+    car: tuple[float, float],
+    planner: str,
+    friction: int | None,
+) -> Controller:
+    """Return a controller that drives in a lane, see `control.InLane`.
+
+    Args:
+        inner: the shielded controller of references.
+        plant: vehicle.
+        law: around which the model was learned.
+        certificate: with a corridor, whose class the references keep.
+        horizon: how many steps of the reference `inner` reads.
+        car: length and width [m].
+        planner: that searches for a reference, in `PLANNERS`.
+        friction: entry of e that is the friction; None if none is.
+    """
+    corridor, road = certificate["corridor"], certificate["boxes"]["control"]
+    under, state = corridor["conditions"], _conditions(law, certificate).state
+    # The sharpest slope of the sinusoids that the roads of the class are made of.
+    turning = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
+    kind = control.Class(
+        curvature=min(under["peak_curvature"], road[1][CURVATURE]),
+        turning=turning,
+        lateral=min(under["lateral_acceleration"], float(law.high[0])),
+        speed=(road[0][REFERENCE_SPEED], road[1][REFERENCE_SPEED]),
+    )
+    heading = 0.0 if state is None else max(abs(end[HEADING]) for end in state)
+    body = control.Body(
+        half=(0.5 * car[0], 0.5 * car[1]),
+        corridor=corridor["corridor_m"],
+        heading=heading,
+    )
+    manoeuvres = control.Manoeuvres(kind=kind, body=body, dt=plant.dt)
+    search = PLANNERS[planner](manoeuvres.task(), **SEARCH, **SEARCHES.get(planner, {}))
+    return control.in_lane(
+        inner=inner,
+        planner=search,
+        manoeuvres=manoeuvres,
+        dt=plant.dt,
+        horizon=horizon,
+        friction=friction,
+        lowest=certificate["boxes"]["env"][0][friction or 0],
+    )
 
 
 def _sensors(corridor: Mapping[str, Any]) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
 from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
-from sfkd_jax.ranges import AtLeastTwo, Positive
+from sfkd_jax.ranges import AtLeastOne, Positive
 from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
@@ -145,7 +145,7 @@ class Planner:
 
     task: Task
     _: KW_ONLY
-    horizon: AtLeastTwo = 20
+    horizon: AtLeastOne = 20
     noise_std: tuple[Positive, ...] = (0.02, 0.3)
     unroll: int = 2
     env_low: tuple[float, ...] | None = None

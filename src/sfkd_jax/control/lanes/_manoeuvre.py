@@ -1,0 +1,329 @@
+"""Choosing a reference: its parameters as a plan, and what makes it admissible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sfkd_jax.control.lanes._reference import (
+    BEHIND,
+    SPLICE,
+    Committed,
+    Curve,
+    RoadAhead,
+    Timing,
+    curve,
+    speed_profile,
+    timing,
+)
+from sfkd_jax.control.tasks._task import (
+    PlanningStart,
+    RolloutSetup,
+    StepIndex,
+    StepResult,
+    Task,
+)
+from sfkd_jax.geometry import SMALLEST_SCALE
+from sfkd_jax.lanes import Obstacles, body_clearance
+from sfkd_jax.paths import quintic
+from sfkd_jax.ranges import NonNegative, Positive, Span, check_intervals
+from sfkd_jax.types import Control, Params, Scalar
+
+SHORTEST = 12.0
+"""Of a lateral move [m]."""
+LATE = 0.03
+"""Distances are those at samples; in between an obstacle may be nearer by less [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Class:
+    """The references of which a corridor was certified.
+
+    Attributes:
+        curvature: largest [1/m].
+        turning: largest change of the curvature per length [1/m²].
+        lateral: largest v² κ [m/s²].
+        speed: lowest and highest [m/s].
+        acceleration: largest [m/s²].
+        deceleration: largest in a planned change of speed [m/s²].
+    """
+
+    curvature: Positive
+    turning: Positive
+    lateral: Positive
+    speed: Span
+    acceleration: Positive = 0.5
+    deceleration: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        check_intervals(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """The car as a box around its reference point, and what it may be off by.
+
+    Attributes:
+        half: half of its length and width [m].
+        corridor: bound of |e_y| [m].
+        heading: bound of |e_ψ| [rad].
+    """
+
+    half: tuple[Positive, Positive]
+    corridor: NonNegative
+    heading: NonNegative
+
+    @property
+    def margin(self) -> float:
+        """What a point of the box may be off to the side [m]."""
+        return self.corridor + self.swing
+
+    @property
+    def swing(self) -> float:
+        """What the heading moves its ends to the side [m]."""
+        return self.half[0] * self.heading
+
+
+class Situation(NamedTuple):
+    """What references are judged by.
+
+    Attributes:
+        road: ahead.
+        committed: reference, from the same sample on.
+        obstacles: all of them finite.
+        place: of the car, in samples from the first one.
+        grip: acceleration that a plan may use [m/s²].
+    """
+
+    road: RoadAhead
+    committed: Committed
+    obstacles: Obstacles
+    place: Scalar
+    grip: Scalar
+
+
+class Judged(NamedTuple):
+    """What a reference is worth.
+
+    Attributes:
+        cost: to be compared with those of others.
+        outside: how far it leaves the class, relative; not above 0 inside.
+        gap: smallest distance from obstacles [m], less nothing, (sample,).
+        edge: smallest distance from the edges, less the corridor [m], (sample,).
+        curve: in the world.
+        timing: along it.
+    """
+
+    cost: Scalar
+    outside: Scalar
+    gap: Float[Array, " sample"]
+    edge: Float[Array, " sample"]
+    curve: Curve
+    timing: Timing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manoeuvres:
+    """The task of choosing a reference: one row of parameters, evaluated at once.
+
+        (d_1, ℓ_1, d_2, ℓ_2, v):   d(s) → d_1 over ℓ_1, then → d_2 over ℓ_2
+
+    Both moves are quintics from what is committed at `SPLICE` on, continuous in
+    position, yaw and curvature; the speed approaches v where the road allows it. ℓ and
+    v are relative to their middle and to what is wanted.
+
+        J = ∫ w_d d² + w_κ κ² + w_κ' κ'² + w_v (v − v_wanted)² + w_n n² ds
+
+    n is what the free distance lacks of `comfort`. What leaves the class, the lane or
+    comes too near to an obstacle violates the constraint.
+
+    Attributes:
+        kind: the references of which a corridor was certified.
+        body: of the car.
+        dt: sampling period of the obstacles [s].
+        widest: largest offset from the centre line [m].
+        comfort: distance from obstacles beyond what is needed [m].
+        standoff: distance from what is in the way at which it stands [m].
+        weights: w_d, w_κ, w_κ', w_v, w_n.
+    """
+
+    kind: Class
+    body: Body
+    dt: Positive
+    widest: Positive = 5.0
+    comfort: Positive = 0.5
+    standoff: NonNegative = 1.0
+    weights: tuple[NonNegative, ...] = (0.02, 1e4, 1e6, 1.0, 1.0)
+
+    def task(self) -> Task:
+        """Return the planning problem as functions."""
+        edge = jnp.asarray([self.widest, 30.0, self.widest, 30.0, 30.0])
+        return Task(
+            -edge,
+            edge,
+            jnp.asarray(self.weights),
+            self.prepare,
+            self.step,
+            lambda *_: None,
+            constraint=lambda _, violation, *__: violation[None],
+        )
+
+    def prepare(
+        self,
+        params: Params,
+        situation: Situation,
+        env: Any,
+        reference: Any,
+        start: PlanningStart,
+    ) -> RolloutSetup:
+        """Return the situation; there is one step."""
+        del params, env, reference, start
+        return RolloutSetup(situation, jnp.zeros(()), jnp.zeros(1))
+
+    def step(
+        self,
+        weights: Any,
+        situation: Situation,
+        sample: Scalar,
+        row: Control,
+        target: Any,
+        at: StepIndex,
+    ) -> StepResult:
+        """Return the cost of one row and its violation in place of a state."""
+        del target, at
+        judged = self.judge(weights, situation, self.reference(situation, row))
+        return StepResult(sample, judged.cost, row, row, self.violation(judged))
+
+    def reference(self, situation: Situation, row: Control) -> Committed:
+        """Return the reference of a row of parameters."""
+        road, before = situation.road, situation.committed
+        spacing, count = road.spacing, before.square.shape[0]
+        longest = 0.5 * spacing * (count - 1 - SPLICE)
+        middle = 0.5 * (SHORTEST + longest)
+        first, second = jnp.clip(row[1:4:2] + middle, SHORTEST, longest)
+        ahead = spacing * jnp.arange(count - SPLICE)
+        over = jax.vmap(quintic, in_axes=(None, None, None, 0))
+        away = over(before.move[SPLICE], row[0], first, ahead)[:, :3]
+        start = jnp.stack([row[0], 0.0, 0.0])
+        back = over(start, row[2], second, jnp.maximum(ahead - first, 0.0))[:, :3]
+        moved = jnp.where((ahead < first)[:, None], away, back)
+        move = jnp.concatenate([before.move[:SPLICE], moved])
+        # Not faster than is wanted, and not so slow that no corridor is known.
+        slowest, fastest = self.kind.speed
+        wanted = jnp.sqrt(jnp.max(road.wanted)) + jnp.minimum(row[4], 0.0)
+        target = jnp.clip(wanted, slowest, fastest)
+        most = jnp.minimum(road.wanted, target**2)
+        accelerations = self.kind.acceleration, self.kind.deceleration
+        square = speed_profile(most, before.square[BEHIND], spacing, *accelerations)
+        square = jnp.concatenate([before.square[:BEHIND], square[BEHIND:]])
+        return Committed(before.index, move, square)
+
+    def stop(
+        self, situation: Situation, judged: Judged, clean: Bool[Array, ""]
+    ) -> Committed:
+        """Return the committed reference with a stop before what blocks it.
+
+        Args:
+            situation: with the committed reference.
+            judged: that reference.
+            clean: whether what blocks it is known; else it stops at once.
+        """
+        before, spacing = situation.committed, situation.road.spacing
+        samples = jnp.arange(before.square.shape[0])
+        start = before.square[BEHIND]
+        # Beside the lateral acceleration of the bend.
+        bend = start * jnp.abs(judged.curve.curvature[BEHIND])
+        grip = jnp.sqrt(jnp.maximum(situation.grip**2 - bend**2, 0.01))
+        gentle = jnp.minimum(self.kind.deceleration, grip)
+        until = jnp.where(clean, jnp.argmax(self.blocked(judged)), 0)
+        until = until * spacing - self.standoff
+        left = jnp.maximum(until - situation.place * spacing, 1e-3)
+        needed = jnp.clip(0.5 * start / left, gentle, grip)
+        most = 2.0 * needed * jnp.maximum(until - samples * spacing, 0.0)
+        most = jnp.minimum(before.square, most)
+        square = speed_profile(most, start, spacing, self.kind.acceleration, grip)
+        return before._replace(
+            square=jnp.where(samples < BEHIND, before.square, square)
+        )
+
+    def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
+        """Return what a reference costs, how far it leaves the class, and its room."""
+        road, kind = situation.road, self.kind
+        along, spacing = curve(road, plan.move), road.spacing
+        when = timing(along.stretch, plan.square, spacing)
+        late = slice(SPLICE, None)
+        curvature, square = along.curvature, plan.square
+        turning = jnp.diff(curvature) / when.lengths
+        # What is behind the splice cannot be changed any more.
+        shares = jnp.stack(
+            [
+                jnp.abs(curvature) / kind.curvature,
+                square * jnp.abs(curvature) / jnp.minimum(kind.lateral, situation.grip),
+                square / kind.speed[1] ** 2,
+                jnp.abs(jnp.append(turning, 0.0)) / kind.turning,
+                jnp.where(along.scale < SMALLEST_SCALE, 2.0, 0.0),
+            ]
+        )
+        outside = jnp.max(jnp.where(when.reached, shares, 0.0)[:, late]) - 1.0
+        gap = self._gap(situation, along, when)
+        edge = self._edge(road, plan.move, along, when)
+        wanted = jnp.sqrt(road.wanted)
+        costs = jnp.stack(
+            [
+                plan.move[:, 0] ** 2,
+                (curvature - road.points[:, 3]) ** 2,
+                jnp.append(turning, 0.0) ** 2,
+                (wanted - jnp.sqrt(square)) ** 2,
+                jnp.clip(self.comfort - gap, 0.0, self.comfort) ** 2,
+            ]
+        )
+        cost = spacing * jnp.sum(weights @ costs[:, BEHIND:])
+        return Judged(cost, outside, gap, edge, along, when)
+
+    def free(self, judged: Judged) -> Bool[Array, ""]:
+        """Whether a reference keeps its distance from obstacles and edges."""
+        return ~jnp.any(self.blocked(judged))
+
+    def blocked(self, judged: Judged) -> Bool[Array, " sample"]:
+        """Where a reference comes too near to something; NaN does."""
+        return ~(jnp.minimum(judged.gap, judged.edge) >= 0.0)
+
+    def violation(self, judged: Judged) -> Scalar:
+        """Return how far a reference is from being admissible, 0 if it is."""
+        room = jnp.minimum(jnp.min(judged.gap), jnp.min(judged.edge))
+        return jnp.maximum(jnp.maximum(judged.outside, -room), 0.0)
+
+    def _gap(
+        self, situation: Situation, along: Curve, when: Timing
+    ) -> Float[Array, " sample"]:
+        """Distance from obstacles beyond what is needed [m], (sample,)."""
+        now = jnp.interp(situation.place, jnp.arange(when.times.size), when.times)
+        steps = (when.times - now) / self.dt
+
+        def at(position: Array, direction: Array, step: Scalar) -> Scalar:
+            return jnp.min(
+                body_clearance(
+                    situation.obstacles, position, direction, self.body.half, step
+                )
+            )
+
+        nearest = jax.vmap(at)(
+            along.position[BEHIND:], along.direction[BEHIND:], steps[BEHIND:]
+        )
+        nearest = jnp.where(when.reached[BEHIND:], nearest, jnp.inf)
+        passed = jnp.full(BEHIND, jnp.inf)
+        return jnp.concatenate([passed, nearest - self.body.margin - LATE])
+
+    def _edge(
+        self, road: RoadAhead, move: Array, along: Curve, when: Timing
+    ) -> Float[Array, " sample"]:
+        """Distance from the edges beyond what is needed [m], (sample,)."""
+        length, width = self.body.half
+        aside = length * jnp.abs(move[:, 1]) / along.stretch + width + self.body.margin
+        room = jnp.minimum(road.left - move[:, 0], road.right + move[:, 0]) - aside
+        beyond = jnp.arange(move.shape[0]) < BEHIND
+        return jnp.where(beyond | ~when.reached, jnp.inf, room)

@@ -1,0 +1,273 @@
+"""A reference beside the centre line, on the samples of the road.
+
+Offset d, its derivatives by the arc length s of the road, and the speed belong to
+samples of the road itself: as the car drives on, the arrays move by whole samples, and
+nothing is rounded.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sfkd_jax.lanes import Lane
+from sfkd_jax.paths import Lap, Path, point_at
+from sfkd_jax.types import Reference, Scalar
+
+BEHIND = 2
+"""Samples behind the car: the projection of a measured position also goes back."""
+SPLICE = BEHIND + 2
+"""The first sample at which a new plan may differ: it lies ahead of the car."""
+STANDS = 1e-3
+"""Speed below which nothing moves [m/s]."""
+
+
+class Committed(NamedTuple):
+    """The reference that the car follows.
+
+    Attributes:
+        index: of the first sample of the road; negative ones are before its start.
+        move: d [m], d' [-], d'' [1/m] of each sample, (sample, 3).
+        square: v² at each sample [m²/s²], between two of them linear in s: an
+            acceleration that is constant.
+    """
+
+    index: Int[Array, ""]
+    move: Float[Array, "sample 3"]
+    square: Float[Array, " sample"]
+
+    def at(self, index: Int[Array, ""], most: Float[Array, " sample"]) -> Committed:
+        """Return the same reference from another sample on, its last values held.
+
+        Args:
+            index: of the first sample.
+            most: v² at its samples, which what is held keeps [m²/s²].
+        """
+        count = self.square.shape[0]
+        rows = jnp.arange(count) + index - self.index
+        held = jnp.clip(rows, 0, count - 1)
+        ended = (rows >= count)[:, None] & jnp.asarray([False, True, True])
+        move = jnp.where(ended, 0.0, self.move[held])
+        square = self.square[held]
+        square = jnp.where(rows < count, square, jnp.minimum(square, most))
+        return Committed(index, move, square)
+
+
+class RoadAhead(NamedTuple):
+    """Samples of the road, (sample, …).
+
+    Attributes:
+        points: x [m], y [m], yaw [rad], curvature κ [1/m].
+        direction: cosine and sine of the yaw.
+        slope: dκ/ds [1/m²].
+        left: to the left edge [m].
+        right: to the right edge [m].
+        wanted: v² [m²/s²], within the accelerations.
+        spacing: of the samples [m].
+    """
+
+    points: Float[Array, "sample 4"]
+    direction: Float[Array, "sample 2"]
+    slope: Float[Array, " sample"]
+    left: Float[Array, " sample"]
+    right: Float[Array, " sample"]
+    wanted: Float[Array, " sample"]
+    spacing: Scalar
+
+
+class Curve(NamedTuple):
+    """A reference in the world, at the samples of the road.
+
+    Attributes:
+        position: [m], (sample, 2).
+        direction: cosine and sine of its yaw, (sample, 2).
+        curvature: of the curve itself [1/m].
+        stretch: its length per length of the road.
+        scale: 1 − κ d; below 0.2 the offset reaches the centre of the bend.
+    """
+
+    position: Float[Array, "sample 2"]
+    direction: Float[Array, "sample 2"]
+    curvature: Float[Array, " sample"]
+    stretch: Float[Array, " sample"]
+    scale: Float[Array, " sample"]
+
+
+def road_ahead(
+    lane: Lane, index: Int[Array, ""], count: int, accelerations: tuple[float, float]
+) -> RoadAhead:
+    """Return the samples of a lane from one on.
+
+    Beyond the end of an open path its last sample is repeated, at speed 0.
+
+    Args:
+        lane: with its path.
+        index: of the first sample.
+        count: of samples.
+        accelerations: largest, and largest deceleration [m/s²].
+    """
+    path, last = lane.path, lane.path.points.shape[0] - 1
+    wanted_rows = index + jnp.arange(count)
+    rows, speed = jnp.clip(wanted_rows, 0, last), lane.speed
+    points = path.points[rows]
+    if isinstance(path, Lap):
+        laps = wanted_rows // last
+        rows = wanted_rows - laps * last
+        turned = laps * (path.points[-1, 2] - path.points[0, 2])
+        points = path.points[rows].at[:, 2].add(turned)
+        squares = speed[rows] ** 2
+    else:
+        squares = jnp.where(wanted_rows >= last, 0.0, speed[rows] ** 2)
+    # From behind: at each sample what can still slow down to all that follow.
+    gained, lost = (
+        2.0 * most * path.spacing * jnp.arange(count) for most in accelerations
+    )
+    wanted = jax.lax.cummin(squares + lost, reverse=True) - lost
+    wanted = jax.lax.cummin(wanted - gained) + gained
+    direction = jnp.stack([jnp.cos(points[:, 2]), jnp.sin(points[:, 2])], axis=1)
+    slope = jnp.asarray(jnp.gradient(points[:, 3])) / path.spacing
+    edges = lane.left[rows], lane.right[rows]
+    return RoadAhead(points, direction, slope, *edges, wanted, path.spacing)
+
+
+def curve(road: RoadAhead, move: Float[Array, "sample 3"]) -> Curve:
+    """Return an offset curve in the world, exact.
+
+        p = p_r + d n,   dp/ds = (1 − κ_r d) t + d' n,   κ = dψ/ds / |dp/ds|
+        dψ/ds = κ_r + (d'' (1 − κ_r d) + d' (κ_r' d + κ_r d')) / |dp/ds|²
+
+    Args:
+        road: κ_r and its frames.
+        move: d, d', d''.
+    """
+    d, first, second = move[:, 0], move[:, 1], move[:, 2]
+    bend = road.points[:, 3]
+    cos, sin = road.direction[:, 0], road.direction[:, 1]
+    scale = 1.0 - bend * d
+    square = scale**2 + first**2
+    stretch = jnp.sqrt(square)
+    turn = bend + (second * scale + first * (road.slope * d + bend * first)) / square
+    return Curve(
+        position=road.points[:, :2] + d[:, None] * jnp.stack([-sin, cos], axis=1),
+        direction=jnp.stack([scale * cos - first * sin, scale * sin + first * cos], 1)
+        / stretch[:, None],
+        curvature=turn / stretch,
+        stretch=stretch,
+        scale=scale,
+    )
+
+
+def speed_profile(
+    most: Float[Array, " sample"],
+    start: Scalar,
+    spacing: Scalar,
+    acceleration: Scalar | float,
+    deceleration: Scalar | float,
+) -> Float[Array, " sample"]:
+    """Return v² from a speed on, as near to what is wanted as accelerations allow.
+
+    Args:
+        most: v² that is wanted [m²/s²].
+        start: v² at the car, sample `BEHIND` [m²/s²].
+        spacing: of the samples [m].
+        acceleration: largest [m/s²].
+        deceleration: largest [m/s²].
+    """
+    ahead = spacing * (jnp.arange(most.shape[0]) - BEHIND)
+    fastest = start + 2.0 * acceleration * jnp.maximum(ahead, 0.0)
+    slowest = start - 2.0 * deceleration * jnp.maximum(ahead, 0.0)
+    return jnp.maximum(jnp.clip(most, slowest, fastest), 0.0)
+
+
+class Timing(NamedTuple):
+    """When a reference is where.
+
+    Attributes:
+        times: from the first sample on [s], (sample,).
+        lengths: of the curve from each sample to the next [m], (sample − 1,).
+        reached: whether the car ever comes there, (sample,).
+    """
+
+    times: Float[Array, " sample"]
+    lengths: Float[Array, " gap"]
+    reached: Bool[Array, " sample"]
+
+
+def timing(
+    stretch: Float[Array, " sample"], square: Float[Array, " sample"], spacing: Scalar
+) -> Timing:
+    """Return when a reference passes its samples.
+
+    Args:
+        stretch: length of the curve per length of the road.
+        square: v² [m²/s²].
+        spacing: of the samples [m].
+    """
+    speed = jnp.sqrt(square)
+    lengths = 0.5 * spacing * (stretch[1:] + stretch[:-1])
+    both = speed[1:] + speed[:-1]
+    # Where it stands it stays: hours, and not infinity, of which sums make NaN.
+    gaps = 2.0 * lengths / jnp.maximum(both, STANDS)
+    times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gaps)])
+    # Behind the car it has been.
+    stood = (both <= STANDS) & (jnp.arange(both.shape[0]) >= BEHIND)
+    reached = jnp.concatenate([jnp.asarray([True]), jnp.cumsum(stood) == 0])
+    return Timing(times, lengths, reached)
+
+
+def window(
+    path: Path,
+    committed: Committed,
+    when: Timing,
+    place: Scalar,
+    *,
+    dt: float,
+    horizon: int,
+) -> Reference:
+    """Return the next points of the reference, x, y, yaw, speed, (horizon, 4).
+
+    Args:
+        path: that the reference is beside.
+        committed: the reference.
+        when: its timing.
+        place: of the car, in samples from the first one.
+        dt: sampling period [s].
+        horizon: number of points, the first one dt ahead.
+    """
+    squares, spacing = committed.square, path.spacing
+    speed = jnp.sqrt(squares)
+    slopes = 0.5 * jnp.diff(squares) / when.lengths
+    last = squares.shape[0] - 2
+    # When the reference was where the car is, from the start of its cell on.
+    here = jnp.clip(jnp.floor(place).astype(int), 0, last)
+    passed = (place - here) * when.lengths[here]
+    now = jnp.sqrt(jnp.maximum(squares[here] + 2.0 * slopes[here] * passed, 0.0))
+    since = 2.0 * passed / jnp.maximum(speed[here] + now, STANDS)
+    times = when.times[here] + since + dt * jnp.arange(1, horizon + 1)
+
+    def point(time: Scalar) -> Float[Array, " 4"]:
+        at = jnp.clip(jnp.searchsorted(when.times, time, side="right") - 1, 0, last)
+        later = time - when.times[at]
+        along = speed[at] * later + 0.5 * slopes[at] * later**2
+        along = jnp.clip(along, 0.0, when.lengths[at])
+        share = along / when.lengths[at]
+        d, first, second = committed.move[at]
+        third = (committed.move[at + 1, 2] - second) / spacing
+        h = share * spacing
+        offset = d + h * (first + h * (second / 2.0 + h * third / 6.0))
+        slope = first + h * (second + h * third / 2.0)
+        x, y, yaw, bend = point_at(path, (committed.index + at + share) * spacing)
+        square = jnp.maximum(squares[at] + 2.0 * slopes[at] * along, 0.0)
+        return jnp.stack(
+            [
+                x - offset * jnp.sin(yaw),
+                y + offset * jnp.cos(yaw),
+                yaw + jnp.arctan2(slope, 1.0 - bend * offset),
+                jnp.sqrt(square),
+            ]
+        )
+
+    return jax.vmap(point)(times)
