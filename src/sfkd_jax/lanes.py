@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.paths import Path
-from sfkd_jax.types import Scalar
 
 
 class Lane(NamedTuple):
@@ -39,21 +39,11 @@ class Obstacles(NamedTuple):
         present: whether the row is an obstacle, (obstacle,); the others are padding.
     """
 
-    position: Float[Array, "obstacle step 2"]
-    yaw: Float[Array, " obstacle"]
-    half: Float[Array, "obstacle 2"]
-    radius: Float[Array, " obstacle"]
-    present: Bool[Array, " obstacle"]
-
-    def at(self, step: Scalar | float) -> Float[Array, "obstacle 2"]:
-        """Return where they are after a number of steps, which may be a fraction."""
-        last = self.position.shape[1] - 1
-        if last == 0:
-            return self.position[:, 0]
-        step = jnp.clip(step, 0.0, last)
-        index = jnp.minimum(jnp.floor(step).astype(int), last - 1)
-        before, after = self.position[:, index], self.position[:, index + 1]
-        return before + (step - index) * (after - before)
+    position: Float[Array, "*obstacle step 2"]
+    yaw: Float[Array, "*obstacle"]
+    half: Float[Array, "*obstacle 2"]
+    radius: Float[Array, "*obstacle"]
+    present: Bool[Array, "*obstacle"]
 
 
 def lane_along(path: Path, *, width: float = 7.0, speed: float = 10.0) -> Lane:
@@ -85,89 +75,91 @@ def circles(
 
 
 def outside_box(
-    away: Float[Array, "*shape 2"],
-    yaw: Float[Array, "*shape"],
-    half: Float[Array, "*shape 2"],
-) -> Float[Array, "*shape"]:
-    """Return the distance from a box [m], negative inside.
+    along: Float[Array, "*shape"],
+    left: Float[Array, "*shape"],
+    half: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
+) -> Float[Array, ...]:
+    """Return the distance of a point from a box [m], negative inside.
 
     Args:
-        away: from its centre to the point [m].
-        yaw: of the box [rad].
+        along: from the centre to the point, along the box [m].
+        left: across it [m].
         half: half of length and width [m].
     """
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    along = cos * away[..., 0] + sin * away[..., 1]
-    left = cos * away[..., 1] - sin * away[..., 0]
-    beyond = jnp.abs(jnp.stack([along, left], axis=-1)) - half
+    along, left = jnp.abs(along) - half[0], jnp.abs(left) - half[1]
     # Outside: distance to the nearest corner or side; inside: to the nearest side.
+    corner = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(left, 0.0) ** 2
     # Finite derivatives in the corner too.
-    corner = jnp.sqrt(jnp.sum(jnp.maximum(beyond, 0.0) ** 2, axis=-1) + 1e-12)
-    return corner + jnp.minimum(jnp.max(beyond, axis=-1), 0.0)
+    return jnp.sqrt(corner + 1e-12) + jnp.minimum(jnp.maximum(along, left), 0.0)
 
 
 def clearance(
-    obstacles: Obstacles, position: Float[Array, " 2"], step: Scalar | float = 0.0
-) -> Float[Array, " obstacle"]:
-    """Return the distance of a point from each obstacle [m], negative inside.
-
-    Infinite where none is present.
-
-    Args:
-        obstacles: (obstacle,).
-        position: of the point [m].
-        step: number of steps from now, which may be a fraction.
-    """
-    away = position - obstacles.at(step)
-    distance = outside_box(away, obstacles.yaw, obstacles.half) - obstacles.radius
-    return jnp.where(obstacles.present, distance, jnp.inf)
-
-
-def body_clearance(
     obstacles: Obstacles,
-    position: Float[Array, " 2"],
-    direction: Float[Array, " 2"],
-    half: tuple[float, float],
-    step: Scalar | float = 0.0,
-) -> Float[Array, " obstacle"]:
-    """Return how far a box is from each obstacle at least [m], negative inside.
+    position: Float[Array, "2 ..."],
+    step: Float[Array, ...] | float = 0.0,
+    *,
+    direction: Float[Array, "2 ..."] | tuple[float, float] = (1.0, 0.0),
+    half: tuple[float, float] = (0.0, 0.0),
+) -> Float[Array, "obstacle ..."]:
+    """Return how far a box is at least from each obstacle [m], negative inside.
 
-    Exact for circles. Of two boxes it is the larger distance of one from the smallest
-    box that holds the other and is parallel to the first.
+    Exact for a point and for circles; of two boxes it is the distance of one from the
+    smallest box around the other that is parallel to it, or the other way round,
+    whichever is larger. Infinite where no obstacle is present.
 
     Args:
         obstacles: (obstacle,).
         position: of the centre of the box [m].
-        direction: cosine and sine of its yaw.
-        half: half of its length and width [m].
         step: number of steps from now, which may be a fraction.
+        direction: cosine and sine of the yaw of the box.
+        half: half of its length and width [m]; 0 for a point.
     """
-    x, y = (obstacles.at(step) - position).T
-    theirs = jnp.cos(obstacles.yaw), jnp.sin(obstacles.yaw)
-    cos, sin = direction[0], direction[1]
-    parallel = jnp.abs(theirs[0] * cos + theirs[1] * sin)
-    across = jnp.abs(theirs[1] * cos - theirs[0] * sin)
-    length, width = obstacles.half[:, 0], obstacles.half[:, 1]
+    return jax.vmap(lambda one: distance(one, position, step, direction, half))(
+        obstacles
+    )
 
-    def apart(axis: tuple[Array, Array], along: Array, left: Array) -> Array:
-        """The distance of a point from a box in the frame of an axis."""
-        beyond_along = jnp.abs(axis[0] * x + axis[1] * y) - along
-        beyond_left = jnp.abs(axis[0] * y - axis[1] * x) - left
-        outside = (
-            jnp.maximum(beyond_along, 0.0) ** 2 + jnp.maximum(beyond_left, 0.0) ** 2
-        )
-        inside = jnp.minimum(jnp.maximum(beyond_along, beyond_left), 0.0)
-        return jnp.sqrt(outside) + inside
 
-    ours = apart(
-        (cos, sin),
+def distance(
+    obstacle: Obstacles,
+    position: Float[Array, "2 ..."],
+    step: Float[Array, ...] | float,
+    direction: Float[Array, "2 ..."] | tuple[float, float],
+    half: tuple[float, float],
+) -> Float[Array, ...]:
+    """Return the `clearance` from one obstacle, a row of `Obstacles`."""
+    x, y = (
+        a - b for a, b in zip(_place(obstacle.position, step), position, strict=True)
+    )
+    (cos, sin), (length, width) = direction, obstacle.half
+    their_cos, their_sin = jnp.cos(obstacle.yaw), jnp.sin(obstacle.yaw)
+    parallel = jnp.abs(their_cos * cos + their_sin * sin)
+    across = jnp.abs(their_sin * cos - their_cos * sin)
+    ours = (
         half[0] + length * parallel + width * across,
         half[1] + length * across + width * parallel,
     )
-    other = apart(
-        theirs,
+    theirs = (
         length + half[0] * parallel + half[1] * across,
         width + half[0] * across + half[1] * parallel,
     )
-    distance = jnp.maximum(ours, other) - obstacles.radius
-    return jnp.where(obstacles.present, distance, jnp.inf)
+    nearest = jnp.maximum(
+        outside_box(cos * x + sin * y, cos * y - sin * x, ours),
+        outside_box(
+            their_cos * x + their_sin * y, their_cos * y - their_sin * x, theirs
+        ),
+    )
+    return jnp.where(obstacle.present, nearest - obstacle.radius, jnp.inf)
+
+
+def _place(
+    positions: Float[Array, "step 2"], step: Float[Array, ...] | float
+) -> Float[Array, "2 ..."]:
+    """Where an obstacle is after a number of steps."""
+    x, y = positions.T
+    last = positions.shape[0] - 1
+    if last == 0:
+        return jnp.stack([x[0], y[0]])
+    step = jnp.clip(step, 0.0, last)
+    index = jnp.minimum(jnp.floor(step).astype(int), last - 1)
+    share = step - index
+    return jnp.stack([z[index] + share * (z[index + 1] - z[index]) for z in (x, y)])

@@ -184,8 +184,8 @@ def reference_window(
 
 
 def quintic(
-    start: Float[Array, " 3"], target: Scalar, length: Scalar, s: Scalar
-) -> Float[Array, " 4"]:
+    start: Float[Array, " 3"], target: Scalar, length: Scalar, s: Float[Array, ...]
+) -> Float[Array, "4 ..."]:
     """Return d, d', d'', d''' of a lateral move at s, derivatives by arc length.
 
     The polynomial of degree five from (d, d', d'') at s = 0 to (target, 0, 0) at
@@ -205,7 +205,7 @@ def quintic(
     fifth = 6.0 * gap - 3.0 * first - second
     coefficients = (fifth, quartic, cubic, second, first, start[0])
     t = jnp.clip(s / length, 0.0, 1.0)
-    # At the end all derivatives by s are those of standing still, the third included.
+    # At the end all derivatives are those of staying there, the third included.
     values, scale = [], jnp.where(s < length, 1.0, 0.0)
     for order in range(4):
         value = jnp.zeros_like(t)

@@ -1,20 +1,30 @@
 """The reference as a plan: lateral moves, obstacles, and what may be committed."""
 
+from functools import partial
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import jit
 
-from sfkd_jax.lanes import Obstacles, circles, clearance
-from sfkd_jax.paths import quintic
+from sfkd_jax import control
+from sfkd_jax.control.lanes._reference import SPLICE, curve, road_ahead
+from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
+from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic
+from sfkd_jax.types import Controller
 
-MOVE = jit(jax.vmap(quintic, in_axes=(None, None, None, 0)))
+MOVE = jit(quintic)
+KIND = control.Class(curvature=0.02, turning=0.0025, lateral=2.0, speed=(8.0, 10.5))
+BODY = control.Body(half=(2.25, 0.9), corridor=0.14, heading=0.05)
+SAMPLES, DT = 200, 0.1
 
 
 def test_a_lateral_move_joins_its_ends_and_its_derivatives_are_those_of_its_offset():
     start, target, length = jnp.asarray([0.4, -0.05, 0.008]), 2.0, 31.0
     s = np.linspace(0.0, 40.0, 4001, dtype=np.float32)
-    move = np.asarray(MOVE(start, target, length, s), np.float64)
+    move = np.asarray(MOVE(start, target, length, s), np.float64).T
     np.testing.assert_allclose(move[0, :3], start, atol=1e-6)
     np.testing.assert_allclose(move[s >= 31.0], [[2.0, 0, 0, 0]] * 901, atol=2e-6)
     before = move[s < 31.0]
@@ -38,3 +48,245 @@ def test_distances_from_boxes_circles_and_things_that_move():
         found = clearance(turned, jnp.zeros(2), step)
         np.testing.assert_allclose(found, [distance, np.inf], atol=1e-5)
     assert clearance(turned, jnp.asarray([4.0, 0.2]))[0] < -1.0
+
+
+def test_two_boxes_are_never_nearer_than_is_said():
+    """Against points on their edges; of a circle the distance is exact."""
+    rng, half = np.random.default_rng(0), (2.25, 0.9)
+    count, edge = 40, np.linspace(-1.0, 1.0, 81)
+    outline = np.concatenate(
+        [np.stack([edge, side + 0 * edge], 1) for side in (-1.0, 1.0)]
+        + [np.stack([side + 0 * edge, edge], 1) for side in (-1.0, 1.0)]
+    )
+    theirs = rng.uniform(0.0, 3.0, (count, 2)) * (np.arange(count) % 2)[:, None]
+    yaw, direction = rng.uniform(-3, 3, count), 0.4
+    position, radius = rng.uniform(-12, 12, (count, 2)), rng.uniform(0.0, 1.0, count)
+
+    def around(centre, angle, half):
+        turn = np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
+        return centre + (outline * half) @ turn
+
+    scene = Obstacles(position[:, None], yaw, theirs, radius, np.ones(count, bool))
+    faces = np.cos(direction), np.sin(direction)
+    found = clearance(
+        jax.tree.map(jnp.asarray, scene),
+        jnp.zeros(2),
+        direction=jnp.asarray(faces),
+        half=half,
+    )
+    for i, said in enumerate(np.asarray(found)):
+        pairs = around(np.zeros(2), direction, half)[:, None] - around(
+            position[i], yaw[i], theirs[i]
+        )
+        real = np.linalg.norm(pairs, axis=-1).min() - radius[i]
+        if real > -radius[i] + 0.1:
+            assert said <= real + 1e-3
+            assert i % 2 or said > real - 0.02
+
+
+@pytest.fixture(scope="module")
+def road():
+    s = np.arange(700) * 0.5
+    bend = 0.006 * np.sin(s / 25.0) * np.clip(s / 20.0, 0.0, 1.0)
+    path = jit(partial(path_from_curvature, spacing=0.5))(np.float32(bend))
+    return lane_along(path, width=12.0)
+
+
+def test_curvature_beside_a_road_is_that_of_the_positions(road):
+    ahead = road_ahead(road, jnp.asarray(100), 400, (1.0, 1.0))
+    move = MOVE(jnp.zeros(3), 3.0, 40.0, 0.5 * jnp.arange(400.0) - 60.0)[:3]
+    along = jax.tree.map(np.asarray, curve(ahead, move))
+    x, y = np.asarray(along.position, np.float64)
+    step = np.hypot(np.diff(x), np.diff(y))
+    yaw = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
+    bend = np.diff(yaw) / (0.5 * (step[1:] + step[:-1]))
+    smooth = np.convolve(bend, np.ones(5) / 5, "valid")
+    off = np.abs(smooth - along.curvature[3:-3])
+    # The smoothed one is off where the slope jumps, at both ends of the move.
+    assert off.max() < 1e-3
+    assert np.sort(off)[-20] < 1e-4
+    np.testing.assert_allclose(
+        step, 0.25 * (along.stretch[1:] + along.stretch[:-1]), rtol=1e-4
+    )
+    middle = np.arctan2(*along.direction[::-1])
+    np.testing.assert_allclose(0.5 * (middle[1:] + middle[:-1]), yaw, atol=1e-4)
+
+
+def follower():
+    """A controller that reports the window it is given, and a certain corridor."""
+
+    def act(params, state, observation, env, reference):
+        info = {"healthy": jnp.asarray(True), "corridor": jnp.asarray(BODY.corridor)}
+        return jnp.zeros(2), state, info
+
+    return Controller(lambda key: jnp.zeros(()), act)
+
+
+@pytest.fixture(scope="module", params=["mppi", "cem"])
+def lane(request):
+    task = control.Manoeuvres(kind=KIND, body=BODY, dt=DT)
+    search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
+    settings = {"num_samples": 100}
+    settings |= (
+        {"iterations": 2, "elites": 10}
+        if request.param == "cem"
+        else {"effective_samples": 5.0}
+    )
+    planner = getattr(control, request.param)(task.task(), **search, **settings)
+    driver = control.in_lane(
+        inner=follower(), planner=planner, manoeuvres=task, dt=DT, horizon=20
+    )
+    return driver, jit(driver.act)
+
+
+def drive(lane, road, seen, steps, *, speed=10.0, friction=0.9):
+    """A car that is always where its reference says; `seen` gives what it sees."""
+    driver, act = lane
+    state = driver.init(jax.random.key(1))
+    car = np.array([0.0, 0.0, 0.0, speed], np.float32)
+    rows = []
+    for number in range(steps):
+        scene = (road, seen(number, car))
+        _, state, info = act(None, state, car, jnp.asarray([friction, 0.0]), scene)
+        rows.append((car, state, jax.tree.map(np.asarray, info)))
+        car = rows[-1][2]["reference"][0]
+    return rows
+
+
+POSTS = np.array([[40.0, 0.4], [85.0, -0.6], [130.0, 0.0], [175.0, 1.2]])
+
+
+def beside(road, places):
+    """Positions [m] at places (s, offset)."""
+    points = np.asarray(road.path.points)[(places[:, 0] * 2).astype(int)]
+    normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], 1)
+    return jnp.asarray(points[:, :2] + places[:, 1:] * normal)
+
+
+def room(car, posts):
+    """Distance of a car from the nearest of them [m]."""
+    faces = jnp.stack([jnp.cos(car[2]), jnp.sin(car[2])])
+    where = jnp.asarray(car[:2])
+    return float(clearance(posts, where, direction=faces, half=BODY.half).min())
+
+
+def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road):
+    posts = circles(beside(road, POSTS), 0.8)
+
+    def seen(number, car):
+        near = np.linalg.norm(np.asarray(posts.position)[:, 0] - car[:2], axis=1) < 60.0
+        return posts._replace(present=jnp.asarray(near))
+
+    rows = drive(lane, road, seen, 180)
+    assert all(bool(info["admissible"]) for _, _, info in rows)
+    cars = np.stack([car for car, _, _ in rows]).astype(np.float64)
+    rooms = [room(car, posts) for car in cars]
+    claims = np.array([info["clearance"] for _, _, info in rows])
+    assert min(rooms) > BODY.margin
+    # What is claimed is about a car anywhere in the corridor.
+    visible = [room(car, seen(0, car)) for car in cars]
+    assert np.all(claims <= np.array(visible) + 1e-3)
+    assert np.mean(cars[:, 3]) > 9.7
+    steps = np.hypot(*np.diff(cars[:, :2], axis=0).T)
+    bend = np.diff(np.unwrap(cars[:, 2])) / steps
+    assert np.abs(bend).max() < KIND.curvature
+    assert np.abs(np.diff(bend)).max() < 1.5 * KIND.turning
+    for (_, before, _), (_, after, _) in pairwise(rows):
+        moved = int(after.committed.index - before.committed.index)
+        # Nothing changes up to the splice, and there all is continuous.
+        np.testing.assert_allclose(
+            after.committed.move[:, : SPLICE + 1],
+            before.committed.move[:, moved : moved + SPLICE + 1],
+            atol=1e-5,
+        )
+
+
+def test_where_nothing_is_admissible_it_stops_in_front_and_goes_on_later(lane, road):
+    wall = circles(
+        beside(road, np.array([[70.0, d] for d in np.arange(-6.0, 6.1, 1.5)])), 0.8
+    )
+    stood = []
+
+    def seen(number, car):
+        return wall._replace(present=jnp.full(9, number < 150))
+
+    rows = drive(lane, road, seen, 200, friction=0.6)
+    for number, (car, _, info) in enumerate(rows[:150]):
+        assert room(car, wall) > 0.5
+        assert bool(info["stopping"]) or number == 0
+        stood.append(car[3])
+    assert stood[-1] == 0.0
+    assert 0.7 < room(rows[149][0], wall) < 2.5
+    assert np.diff(stood).min() > -0.7 * 9.81 * 0.6 * DT - 0.05
+    assert rows[-1][0][3] > 1.5
+    assert not bool(rows[-1][2]["stopping"])
+
+
+@pytest.mark.parametrize("attack", ["jumps", "inside", "nan", "edge"])
+def test_what_is_attacked_is_not_admitted(lane, road, attack):
+    none = circles(beside(road, POSTS[:1]), 0.8)
+    none = none._replace(present=jnp.zeros(1, bool))
+    rows = drive(lane, road, lambda *_: none, 4)
+    act = lane[1]
+    car, state, info = rows[-1]
+    assert bool(info["admissible"])
+    at = {"jumps": 8.0, "inside": 0.0}.get(attack, np.nan)
+    place = car[:2] + at * np.array([np.cos(car[2]), np.sin(car[2])])
+    posts, lane_now = circles(jnp.asarray(place)[None], 0.8), road
+    if attack == "edge":
+        posts, lane_now = none, road._replace(left=jnp.full(700, 0.5))
+    before = state
+    _, state, info = act(None, state, car, jnp.asarray([0.9, 0.0]), (lane_now, posts))
+    assert not bool(info["admissible"])
+    assert bool(info["stopping"])
+    assert bool(info["healthy"]) == (attack != "nan")
+    assert np.isnan(info["clearance"]) if attack == "nan" else True
+    assert np.all(np.isfinite(info["reference"]))
+    assert info["reference"][-1, 3] < 2.0
+    # It brakes where it is, and does not swerve.
+    moved = int(state.committed.index - before.committed.index)
+    np.testing.assert_allclose(
+        state.committed.move[:100],
+        before.committed.move[moved : moved + 100],
+        atol=1e-6,
+    )
+
+
+def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
+    angle = np.linspace(0.0, 2 * np.pi, 2000, endpoint=False)
+    path = path_through(
+        jnp.asarray(80.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)), closed=True
+    )
+    assert isinstance(path, Lap)
+    driver, act = lane
+    track = lane_along(path, width=9.0, speed=9.0)
+    count = act._cache_size()
+    rows = drive(
+        lane,
+        track,
+        lambda *_: circles(jnp.asarray([[80.0, 80.5]]), 0.8),
+        600,
+        speed=9.0,
+    )
+    assert act._cache_size() == count + 1
+    cars = np.stack([car for car, _, _ in rows])
+    radius = np.hypot(cars[:, 0], cars[:, 1] - 80.0)
+    assert np.all(np.abs(radius - 80.0) < 4.0)
+    assert np.diff(np.unwrap(cars[:, 2])).min() > -0.02
+    states = jax.tree.map(lambda *leaf: jnp.stack(leaf), rows[10][1], rows[300][1])
+    scene = track, circles(jnp.asarray([[80.0, 80.5]]), 0.8)
+    where = jnp.stack([rows[11][0], rows[301][0]])
+    batch = jit(
+        jax.vmap(
+            lambda state, car: driver.act(
+                None, state, car, jnp.asarray([0.9, 0.0]), scene
+            )
+        )
+    )
+    _, _, info = batch(states, where)
+    for one, number in enumerate((11, 301)):
+        np.testing.assert_allclose(
+            info["reference"][one], rows[number][2]["reference"], atol=2e-3
+        )

@@ -122,7 +122,7 @@ class InLane:
         inner, planner = jax.random.split(key)
         committed = Committed(
             index=jnp.zeros((), jnp.int32),
-            move=jnp.zeros((self.samples, 3)),
+            move=jnp.zeros((3, self.samples)),
             square=jnp.zeros(self.samples),
         )
         return LaneState(
@@ -176,7 +176,7 @@ class InLane:
             **info,
             "healthy": info["healthy"] & clean,
             "reference": ahead,
-            "offset": jnp.interp(place, jnp.arange(self.samples), committed.move[:, 0]),
+            "offset": jnp.interp(place, jnp.arange(self.samples), committed.move[0]),
             "clearance": jnp.where(clean, room, jnp.nan),
             "admissible": (task.violation(judged) <= 0.0) & clean,
             "stopping": ~judged.timing.reached[-1],
@@ -216,7 +216,7 @@ class InLane:
         most = kind.acceleration, kind.deceleration
         road = road_ahead(lane, first, self.samples, most)
         # It begins where the car is, at its speed.
-        move = jnp.zeros_like(state.committed.move).at[:, 0].set(lateral)
+        move = jnp.zeros_like(state.committed.move).at[0].set(lateral)
         square = speed_profile(
             road.wanted, jnp.maximum(observation[3], 0.0) ** 2, path.spacing, *most
         )
@@ -253,12 +253,12 @@ class InLane:
     ) -> tuple[Any, Committed]:
         """Return the state of the planner and the reference to commit."""
         task, before = self.manoeuvres, situation.committed
-        row, after, _ = self.planner.act(None, planner, situation, None, None)
+        row, after, info = self.planner.act(None, planner, situation, None, None)
         found = task.reference(situation, row)
-        judged = task.judge(planner.tuning.cost, situation, found)
-        better = judged.cost < (1.0 - self.better) * kept.cost
+        better = info["mean_cost"] < (1.0 - self.better) * kept.cost
         better |= task.violation(kept) > 0.0
-        taken = better & (task.violation(judged) <= 0.0) & clean
+        # A plan that continues an old one is not the one that was evaluated.
+        taken = better & info["healthy"] & info["constraints_kept"] & clean
         stop = task.stop(situation, kept, clean)
         stays = task.free(kept) & clean
         otherwise = jax.tree.map(partial(jnp.where, stays), before, stop)

@@ -28,7 +28,7 @@ from sfkd_jax.control.tasks._task import (
     Task,
 )
 from sfkd_jax.geometry import SMALLEST_SCALE
-from sfkd_jax.lanes import Obstacles, body_clearance
+from sfkd_jax.lanes import Obstacles, distance
 from sfkd_jax.paths import quintic
 from sfkd_jax.ranges import NonNegative, Positive, Span, check_intervals
 from sfkd_jax.types import Control, Params, Scalar
@@ -206,12 +206,11 @@ class Manoeuvres:
         middle = 0.5 * (SHORTEST + longest)
         first, second = jnp.clip(row[1:4:2] + middle, SHORTEST, longest)
         ahead = spacing * jnp.arange(count - SPLICE)
-        over = jax.vmap(quintic, in_axes=(None, None, None, 0))
-        away = over(before.move[SPLICE], row[0], first, ahead)[:, :3]
-        start = jnp.stack([row[0], 0.0, 0.0])
-        back = over(start, row[2], second, jnp.maximum(ahead - first, 0.0))[:, :3]
-        moved = jnp.where((ahead < first)[:, None], away, back)
-        move = jnp.concatenate([before.move[:SPLICE], moved])
+        away = quintic(before.move[:, SPLICE], row[0], first, ahead)[:3]
+        start = jnp.stack([row[0], jnp.zeros(()), jnp.zeros(())])
+        back = quintic(start, row[2], second, jnp.maximum(ahead - first, 0.0))[:3]
+        moved = jnp.where(ahead < first, away, back)
+        move = jnp.concatenate([before.move[:, :SPLICE], moved], axis=1)
         # Not faster than is wanted, and not so slow that no corridor is known.
         slowest, fastest = self.kind.speed
         wanted = jnp.sqrt(jnp.max(road.wanted)) + jnp.minimum(row[4], 0.0)
@@ -274,8 +273,8 @@ class Manoeuvres:
         wanted = jnp.sqrt(road.wanted)
         costs = jnp.stack(
             [
-                plan.move[:, 0] ** 2,
-                (curvature - road.points[:, 3]) ** 2,
+                plan.move[0] ** 2,
+                (curvature - road.curvature) ** 2,
                 jnp.append(turning, 0.0) ** 2,
                 (wanted - jnp.sqrt(square)) ** 2,
                 jnp.clip(self.comfort - gap, 0.0, self.comfort) ** 2,
@@ -304,16 +303,16 @@ class Manoeuvres:
         now = jnp.interp(situation.place, jnp.arange(when.times.size), when.times)
         steps = (when.times - now) / self.dt
 
-        def at(position: Array, direction: Array, step: Scalar) -> Scalar:
-            return jnp.min(
-                body_clearance(
-                    situation.obstacles, position, direction, self.body.half, step
-                )
-            )
+        half = self.body.half
+        where, facing = along.position[:, BEHIND:], along.direction[:, BEHIND:]
+        later = steps[BEHIND:]
 
-        nearest = jax.vmap(at)(
-            along.position[BEHIND:], along.direction[BEHIND:], steps[BEHIND:]
-        )
+        # One after the other: all samples of all plans are then one long loop.
+        def nearer(before: Array, one: Obstacles) -> tuple[Array, None]:
+            return jnp.minimum(before, distance(one, where, later, facing, half)), None
+
+        nearest = jnp.full(later.shape, jnp.inf)
+        nearest, _ = jax.lax.scan(nearer, nearest, situation.obstacles)
         nearest = jnp.where(when.reached[BEHIND:], nearest, jnp.inf)
         passed = jnp.full(BEHIND, jnp.inf)
         return jnp.concatenate([passed, nearest - self.body.margin - LATE])
@@ -323,7 +322,7 @@ class Manoeuvres:
     ) -> Float[Array, " sample"]:
         """Distance from the edges beyond what is needed [m], (sample,)."""
         length, width = self.body.half
-        aside = length * jnp.abs(move[:, 1]) / along.stretch + width + self.body.margin
-        room = jnp.minimum(road.left - move[:, 0], road.right + move[:, 0]) - aside
-        beyond = jnp.arange(move.shape[0]) < BEHIND
+        aside = length * jnp.abs(move[1]) / along.stretch + width + self.body.margin
+        room = jnp.minimum(road.left - move[0], road.right + move[0]) - aside
+        beyond = jnp.arange(move.shape[1]) < BEHIND
         return jnp.where(beyond | ~when.reached, jnp.inf, room)

@@ -30,13 +30,13 @@ class Committed(NamedTuple):
 
     Attributes:
         index: of the first sample of the road; negative ones are before its start.
-        move: d [m], d' [-], d'' [1/m] of each sample, (sample, 3).
+        move: d [m], d' [-], d'' [1/m] at each sample, (3, sample).
         square: v² at each sample [m²/s²], between two of them linear in s: an
             acceleration that is constant.
     """
 
     index: Int[Array, ""]
-    move: Float[Array, "sample 3"]
+    move: Float[Array, "3 sample"]
     square: Float[Array, " sample"]
 
     def at(self, index: Int[Array, ""], most: Float[Array, " sample"]) -> Committed:
@@ -49,19 +49,20 @@ class Committed(NamedTuple):
         count = self.square.shape[0]
         rows = jnp.arange(count) + index - self.index
         held = jnp.clip(rows, 0, count - 1)
-        ended = (rows >= count)[:, None] & jnp.asarray([False, True, True])
-        move = jnp.where(ended, 0.0, self.move[held])
+        move = self.move[:, held]
+        move = move.at[1:].set(jnp.where(rows < count, move[1:], 0.0))
         square = self.square[held]
         square = jnp.where(rows < count, square, jnp.minimum(square, most))
         return Committed(index, move, square)
 
 
 class RoadAhead(NamedTuple):
-    """Samples of the road, (sample, …).
+    """Samples of the road, (…, sample).
 
     Attributes:
-        points: x [m], y [m], yaw [rad], curvature κ [1/m].
-        direction: cosine and sine of the yaw.
+        position: [m], (2, sample).
+        direction: cosine and sine of the yaw, (2, sample).
+        curvature: κ [1/m].
         slope: dκ/ds [1/m²].
         left: to the left edge [m].
         right: to the right edge [m].
@@ -69,8 +70,9 @@ class RoadAhead(NamedTuple):
         spacing: of the samples [m].
     """
 
-    points: Float[Array, "sample 4"]
-    direction: Float[Array, "sample 2"]
+    position: Float[Array, "2 sample"]
+    direction: Float[Array, "2 sample"]
+    curvature: Float[Array, " sample"]
     slope: Float[Array, " sample"]
     left: Float[Array, " sample"]
     right: Float[Array, " sample"]
@@ -82,15 +84,15 @@ class Curve(NamedTuple):
     """A reference in the world, at the samples of the road.
 
     Attributes:
-        position: [m], (sample, 2).
-        direction: cosine and sine of its yaw, (sample, 2).
+        position: [m], (2, sample).
+        direction: cosine and sine of its yaw, (2, sample).
         curvature: of the curve itself [1/m].
         stretch: its length per length of the road.
         scale: 1 − κ d; below 0.2 the offset reaches the centre of the bend.
     """
 
-    position: Float[Array, "sample 2"]
-    direction: Float[Array, "sample 2"]
+    position: Float[Array, "2 sample"]
+    direction: Float[Array, "2 sample"]
     curvature: Float[Array, " sample"]
     stretch: Float[Array, " sample"]
     scale: Float[Array, " sample"]
@@ -112,12 +114,8 @@ def road_ahead(
     path, last = lane.path, lane.path.points.shape[0] - 1
     wanted_rows = index + jnp.arange(count)
     rows, speed = jnp.clip(wanted_rows, 0, last), lane.speed
-    points = path.points[rows]
     if isinstance(path, Lap):
-        laps = wanted_rows // last
-        rows = wanted_rows - laps * last
-        turned = laps * (path.points[-1, 2] - path.points[0, 2])
-        points = path.points[rows].at[:, 2].add(turned)
+        rows = wanted_rows % last
         squares = speed[rows] ** 2
     else:
         squares = jnp.where(wanted_rows >= last, 0.0, speed[rows] ** 2)
@@ -127,13 +125,20 @@ def road_ahead(
     )
     wanted = jax.lax.cummin(squares + lost, reverse=True) - lost
     wanted = jax.lax.cummin(wanted - gained) + gained
-    direction = jnp.stack([jnp.cos(points[:, 2]), jnp.sin(points[:, 2])], axis=1)
-    slope = jnp.asarray(jnp.gradient(points[:, 3])) / path.spacing
-    edges = lane.left[rows], lane.right[rows]
-    return RoadAhead(points, direction, slope, *edges, wanted, path.spacing)
+    x, y, yaw, curvature = path.points[rows].T
+    return RoadAhead(
+        position=jnp.stack([x, y]),
+        direction=jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]),
+        curvature=curvature,
+        slope=jnp.asarray(jnp.gradient(curvature)) / path.spacing,
+        left=lane.left[rows],
+        right=lane.right[rows],
+        wanted=wanted,
+        spacing=path.spacing,
+    )
 
 
-def curve(road: RoadAhead, move: Float[Array, "sample 3"]) -> Curve:
+def curve(road: RoadAhead, move: Float[Array, "3 sample"]) -> Curve:
     """Return an offset curve in the world, exact.
 
         p = p_r + d n,   dp/ds = (1 − κ_r d) t + d' n,   κ = dψ/ds / |dp/ds|
@@ -143,17 +148,16 @@ def curve(road: RoadAhead, move: Float[Array, "sample 3"]) -> Curve:
         road: κ_r and its frames.
         move: d, d', d''.
     """
-    d, first, second = move[:, 0], move[:, 1], move[:, 2]
-    bend = road.points[:, 3]
-    cos, sin = road.direction[:, 0], road.direction[:, 1]
+    d, first, second = move
+    bend, (cos, sin) = road.curvature, road.direction
     scale = 1.0 - bend * d
     square = scale**2 + first**2
     stretch = jnp.sqrt(square)
     turn = bend + (second * scale + first * (road.slope * d + bend * first)) / square
+    forward, aside = scale / stretch, first / stretch
     return Curve(
-        position=road.points[:, :2] + d[:, None] * jnp.stack([-sin, cos], axis=1),
-        direction=jnp.stack([scale * cos - first * sin, scale * sin + first * cos], 1)
-        / stretch[:, None],
+        position=road.position + d * jnp.stack([-sin, cos]),
+        direction=jnp.stack([forward * cos - aside * sin, forward * sin + aside * cos]),
         curvature=turn / stretch,
         stretch=stretch,
         scale=scale,
@@ -254,8 +258,8 @@ def window(
         along = speed[at] * later + 0.5 * slopes[at] * later**2
         along = jnp.clip(along, 0.0, when.lengths[at])
         share = along / when.lengths[at]
-        d, first, second = committed.move[at]
-        third = (committed.move[at + 1, 2] - second) / spacing
+        d, first, second = committed.move[:, at]
+        third = (committed.move[2, at + 1] - second) / spacing
         h = share * spacing
         offset = d + h * (first + h * (second / 2.0 + h * third / 6.0))
         slope = first + h * (second + h * third / 2.0)

@@ -66,7 +66,12 @@ def outside_boxes(
         margin: by which each is enlarged, with round corners [m].
     """
     away = position - boxes[:, :2]
-    return margin - outside_box(away, boxes[:, 2], 0.5 * boxes[:, 3:])
+    cos, sin = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
+    along, left = (
+        cos * away[:, 0] + sin * away[:, 1],
+        cos * away[:, 1] - sin * away[:, 0],
+    )
+    return margin - outside_box(along, left, (0.5 * boxes[:, 3], 0.5 * boxes[:, 4]))
 
 
 def at_step(values: Array, at: StepIndex) -> Array:
