@@ -178,14 +178,16 @@ class Policy(TrainedModel):
             car: length and width [m]; its middle is the observed position.
             planner: that searches for a reference, "mppi" or "cem".
         """
-        certificate = self._with_corridor()
+        certificate, law = self._with_corridor(), self.law
+        # A corridor is about path coordinates, and these about a law.
+        assert law is not None
         names = self.interface["environment"]["names"]
         friction = [i for i, name in enumerate(names) if name.startswith("friction")]
         with jax.ensure_compile_time_eval():
             controller = build.build_in_lane(
                 self.controller,
                 self.vehicle,
-                self.law,
+                law,
                 certificate,
                 horizon=self.interface["horizon"],
                 car=car,

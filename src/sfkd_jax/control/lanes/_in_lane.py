@@ -253,7 +253,9 @@ class InLane:
     ) -> tuple[Any, Committed]:
         """Return the state of the planner and the reference to commit."""
         task, before = self.manoeuvres, situation.committed
-        row, after, info = self.planner.act(None, planner, situation, None, None)
+        # Its observation is a situation; it needs neither e nor a reference.
+        act: Any = self.planner.act
+        row, after, info = act(None, planner, situation, None, None)
         found = task.reference(situation, row)
         better = info["mean_cost"] < (1.0 - self.better) * kept.cost
         better |= task.violation(kept) > 0.0
