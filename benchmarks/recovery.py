@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.signal import lfilter
 
 import sfkd_jax
 from benchmarks import device
@@ -29,6 +30,8 @@ from sfkd_jax.types import Controller
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
+MASS, STIFF = 1500.0, {"dynamic": (9.0e4, 1.05e5), "kinematic": (6.0e4, 7.0e4)}
+"""Of the cars [kg], and the stiffness of their axles [N/rad]."""
 NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
 HORIZON, SPACING, PERIOD, TICK = 20, 0.5, 0.1, 0.02
 """Steps of a plan; of path points [m]; of the policies; of the cars between calls [s]."""
@@ -56,6 +59,8 @@ class Now(NamedTuple):
         aside: the reference, moved to the left [m].
         steering: added to the steering angle [rad].
         offset: of the measured pose: ahead, to the left [m], yaw [rad].
+        body: of the measured body state.
+        changed: whether the car is heavier by 30 %, or its tyres 30 % softer (2).
         lag: calls since the reading that the sensor shows.
         lost: whether it shows NaN.
         kind: of the request, index of `KINDS`.
@@ -68,6 +73,8 @@ class Now(NamedTuple):
     aside: Any
     steering: Any
     offset: Any
+    body: Any
+    changed: Any
     lag: Any
     lost: Any
     kind: Any
@@ -135,7 +142,11 @@ class Car:
         mppi = planner["mppi"] | {"num_samples": samples}
         self.loaded = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
         self.name, self.batch = name, batch
-        self.step = getattr(plants, name)(dt=TICK, substeps=1).step
+        made = partial(getattr(plants, name), dt=TICK, substeps=1)
+        front, rear = (0.7 * stiff for stiff in STIFF[name])
+        soft = made(front_stiffness=front, rear_stiffness=rear)
+        cars = made(), made(mass=1.3 * MASS), soft
+        self.steps = [car.step for car in cars]
         self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
         self.states = len(self.loaded.vehicle.state_names)
         self.noise = np.asarray(NOISE[: self.states], np.float32)
@@ -213,6 +224,7 @@ def part_of_run(car, make, runs, carry):
         past = jnp.concatenate([(state + runs.noise * fresh)[None], past[:-1]])
         shift = geometry.rotate(yaw, now.offset[:2])
         seen = past[now.lag].at[:2].add(shift).at[2].add(now.offset[2])
+        seen = seen.at[3:].add(now.body)
         seen = jnp.where(now.lost, jnp.nan, seen)
         # A request is no plan that could be shifted.
         if make == car.make_policy:
@@ -222,7 +234,10 @@ def part_of_run(car, make, runs, carry):
         )
         turned = acted.at[0].add(now.steering)
         after = jax.lax.fori_loop(
-            0, runs.ticks, lambda _, x: car.step(x, turned, now.env), state
+            0,
+            runs.ticks,
+            lambda _, x: jax.lax.switch(now.changed, car.steps, x, turned, now.env),
+            state,
         )
         flags = {
             name: leaf
@@ -273,7 +288,8 @@ def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
     given = {"speed": 10.0, "env": envs[:, np.minimum(at, LONGEST - 1)]} | now
     given = {"told": given["env"]} | given
     shapes = {"offset": (3,), "nu": (2,), "env": (2,), "told": (2,)}
-    kinds = {"lag": np.int32, "kind": np.int32, "lost": bool}
+    shapes |= {"body": (car.states - 3,)}
+    kinds = dict.fromkeys(("lag", "kind", "changed"), np.int32) | {"lost": bool}
     filled = Now(
         *(
             np.broadcast_to(
@@ -519,10 +535,10 @@ def deceptions(steps):
     }
 
 
-def in_class(car, many):
+def in_class(car, many, seed=6):
     """Runs under the conditions of the certificate."""
     about = car.loaded.certificate["corridor"]["conditions"]
-    random = np.random.default_rng(6)
+    random = np.random.default_rng(seed)
     (slow, fast), time_ = about["speed"], PERIOD * np.arange(LONGEST)
     period, phase, swing, level = random.uniform(size=(4, many, 1))
     swung = 0.8 * swing * np.sin(2 * np.pi * (time_ / (5 + 15 * period) + phase))
@@ -543,8 +559,81 @@ def in_class(car, many):
         high=about["env_box"][1],
         dwell=about["dwell_s"],
     )
-    road = roads(many, 6, switching, bends * np.clip(along / 20.0, 0, 1))
-    return runs_on(car, road, LONGEST, 6, speed=speeds)
+    road = roads(many, seed, switching, bends * np.clip(along / 20.0, 0, 1))
+    return runs_on(car, road, LONGEST, seed, speed=speeds)
+
+
+ONSET, LASTS = 60, 140
+"""Call at which a lasting error begins; calls that follow."""
+
+
+def lasting(car):
+    """Errors that stay: label -> entry of `Now`, its direction, size, growth [s]."""
+    told, along = np.asarray([1.0, 0.0]), np.eye(car.states)
+    made = {
+        f"steering offset {size} degrees": ("steering", 1.0, np.deg2rad(size), 0)
+        for size in (0.0, 0.5, 1.0, 2.0)
+    }
+    made["mass + 30 %"] = "changed", 1.0, 1, 0
+    made["tyres - 30 %"] = "changed", 1.0, 2, 0
+    made["friction told wrong by 0.2"] = "told", told, 0.2, 0
+    # Of every sensor five standard deviations, at once and over ten seconds.
+    for place, name in enumerate(car.loaded.vehicle.state_names[1:], start=1):
+        entry, way = ("offset", along[place, :3]), ("body", along[place, 3:])
+        size = float(5 * car.noise[place])
+        made[f"{name} bias {size:.3g}"] = *(entry if place < 3 else way), size, 0
+        made[f"{name} drift {size / 10:.2g}/s"] = (
+            *made[f"{name} bias {size:.3g}"][:3],
+            10,
+        )
+    return made
+
+
+def detection_rows(car, most):
+    """When lasting errors are found in the class: the law alone, and with its ν."""
+    many, time_ = min(most, 1000), np.arange(ONSET + LASTS)
+    runs = in_class(car, many, seed=11)
+    runs = runs._replace(now=jax.tree.map(lambda x: x[:, : len(time_)], runs.now))
+    random, since = np.random.default_rng(11), PERIOD * (time_ - ONSET)
+    sides = random.choice((-1.0, 1.0), (many, 1))
+    about = car.loaded.certificate["corridor"]["conditions"]
+    box = np.asarray(about["env_box"])
+    # As in the data: an AR(1) process, for a quarter of the runs its sign.
+    ends = np.log([about["steering_excitation"], about["speed_excitation"]])
+    sizes = np.exp(random.uniform(*ends.T, (many, 1, 2))) / about["perturbation"]
+    noise = lfilter(
+        [0.44], [1, -0.9], random.normal(size=(many, len(time_), 2)), axis=1
+    )
+    noise = np.where(random.uniform(size=(many, 1, 1)) < 0.25, np.sign(noise), noise)
+    excited = np.clip(sizes * noise, -1.0, 1.0).astype(np.float32)
+    for label, (entry, way, size, growth) in lasting(car).items():
+        share = np.clip(since / growth, 0, 1) if growth else since >= 0
+        added = size * share * (1.0 if entry == "changed" else sides)
+        usual = getattr(runs.now, entry)
+        value = usual + (added[..., None] * way if np.ndim(way) else added)
+        value = np.clip(value, *box) if entry == "told" else value
+        value = np.broadcast_to(value, usual.shape).astype(usual.dtype)
+        steered = label == "steering offset 1.0 degrees"
+        for way_, nu in (("law", runs.now.nu), ("class", excited))[: 1 + steered]:
+            now = runs.now._replace(**{entry: value, "nu": nu})
+            few = slice(None if steered else min(many, 100))
+            made = car.guarded(
+                jax.tree.map(lambda x, f=few: x[f], runs._replace(now=now))
+            )
+            alarm = made["flags"]["innovation_alarm"]
+            found = alarm[:, ONSET + 1 :]
+            late = PERIOD * (np.argmax(found, axis=1) + 1.0)
+            late = np.sort(np.where(found.any(axis=1), late, np.inf))
+            yield (
+                f"detection, {way_}: {label}",
+                {
+                    "runs": len(late),
+                    "before": int(alarm[:, : ONSET + 1].any(axis=1).sum()),
+                    "within_3s": shown((late < 3.05).mean(), 4),
+                    "median_s": shown(late[len(late) // 2], 1),
+                    "s_99": shown(late[int(np.ceil(0.99 * len(late))) - 1], 1),
+                },
+            )
 
 
 def table_rows(car, most):
@@ -654,6 +743,7 @@ ROWS = {
     "rates": rate_rows,
     "planners": planner_rows,
     "costs": cost_rows,
+    "detection": detection_rows,
 }
 
 

@@ -524,8 +524,8 @@ def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause
     weights = np.asarray(control.WINDOWS)[:, None]
     test = control.InnovationTest(
         levels=jnp.zeros(1),
-        deviation=jnp.asarray(DISTURBANCE, float)[None],
-        threshold=jnp.asarray(1.8 * np.sqrt(weights / (2.0 - weights)) * np.ones(3)),
+        deviation=jnp.asarray([*DISTURBANCE, DISTURBANCE[1]], float)[None],
+        threshold=jnp.asarray(1.8 * np.sqrt(weights / (2.0 - weights)) * np.ones(4)),
     )
     blind = lambda o, k: jnp.where(between(k, 61, 66), jnp.nan, o)
     _, info = told(blind, steps=160, disturbances=pushed, test=test)

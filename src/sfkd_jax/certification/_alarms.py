@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeAlias
 
 import jax
@@ -16,7 +17,9 @@ from sfkd_jax.control import (
     PathLaw,
     expected_coordinates,
     steering_level,
+    turning_rate,
 )
+from sfkd_jax.geometry import HEADING
 from sfkd_jax.types import BODY, Key, Model, Params, Trajectory
 
 BATCHES = 10
@@ -27,7 +30,7 @@ MARGIN = 1.25
 """On thresholds: the tail of real runs is somewhat heavier than an exponential."""
 DAY = 86_400.0
 """Time of driving to one false alarm [s]."""
-Observed: TypeAlias = tuple[Float[Array, "run gap coordinate"], Float[Array, "run gap"]]
+Observed: TypeAlias = tuple[Float[Array, "run gap chart"], Float[Array, "run gap"]]
 """Innovations and levels."""
 
 
@@ -37,6 +40,7 @@ def innovations(
     law: PathLaw,
     runs: Trajectory,
     noise: Float[Array, "run time coordinate"],
+    dt: float,
 ) -> Observed:
     """Return the innovations of runs whose law read ξ with this noise, and levels."""
 
@@ -44,7 +48,10 @@ def innovations(
         fiber, road = model.fiber(params, env), inputs[2:]
         # ν beside the law of what was measured: the noise in the control cancels.
         expected = expected_coordinates(model, fiber, xi, inputs[:2], road)
-        return after - expected, steering_level(law, road, env)
+        control = law(xi, road[0], road[1], env) + inputs[:2]
+        turned = dt * turning_rate(law, xi, control, road, env)
+        innovation = jnp.append(after - expected, (after - xi)[HEADING] - turned)
+        return innovation, steering_level(law, road, env)
 
     measured = runs.states[:, :-1, BODY] + noise
     given = measured[:, :-1], measured[:, 1:], runs.controls[:, :-1], runs.envs[:, :-1]
@@ -52,9 +59,7 @@ def innovations(
 
 
 @jax.jit
-def largest_means(
-    test: InnovationTest, seen: Observed
-) -> Float[Array, "run window coordinate"]:
+def largest_means(test: InnovationTest, seen: Observed) -> Float[Array, "run mean"]:
     """Return the largest absolute moving means of each run."""
 
     def one(innovation: Array, level: Array) -> Array:
@@ -63,7 +68,7 @@ def largest_means(
             return means, jnp.abs(means)
 
         start = test.init().means
-        return jnp.max(jax.lax.scan(step, start, (innovation, level))[1], axis=0)
+        return jnp.max(jax.lax.scan(step, start, (innovation, level))[1], 0).ravel()
 
     return jax.vmap(one)(*seen)
 
@@ -89,23 +94,18 @@ def calibrate_innovations(
     test_key, s3_key, *keys = jax.random.split(key, 2 + BATCHES)
     parts = [observe(key) for key in keys]
     innovation, level = (
-        np.concatenate([np.asarray(part[of], np.float64) for part in parts])
-        for of in (0, 1)
+        np.concatenate(part, dtype=np.float64) for part in zip(*parts, strict=True)
     )
     order = np.argsort(level, axis=None)
     sizes = np.asarray(SHARES) * len(order)
     groups = [part for part in np.split(order, sizes.astype(int)) if len(part)]
     steps = innovation.reshape(len(order), -1)
     levels = np.asarray([np.mean(level.ravel()[group]) for group in groups])
-    deviation = [np.sqrt(np.mean(steps[group] ** 2, axis=0)) for group in groups]
+    # NaN where the steering is in no steady turn of the law.
+    deviation = [np.sqrt(np.nanmean(steps[group] ** 2, axis=0)) for group in groups]
     scale = jnp.asarray(levels, float), jnp.asarray(np.stack(deviation), float)
-    untested = InnovationTest(*scale, jnp.ones(()))
-
-    def largest(seen: Observed) -> np.ndarray:
-        means = np.asarray(largest_means(untested, seen), np.float64)
-        return means.reshape(len(means), -1)
-
-    maxima = np.concatenate([largest(part) for part in parts])
+    largest = partial(largest_means, InnovationTest(*scale, jnp.ones(())))
+    maxima = np.concatenate([*map(largest, parts)], dtype=np.float64)
     reference, scores = np.array_split(maxima, 2)
     thresholds = MARGIN * alarm_thresholds(reference, scores, rate=duration / DAY)
     test, s3 = largest(observe(test_key)), largest(observe_s3(s3_key))

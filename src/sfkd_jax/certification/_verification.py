@@ -358,7 +358,7 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
 
 def _innovations(corridor: Mapping[str, Any], trained: Trained) -> Rule:
     """The test of innovations: scales, thresholds and the alarms on new runs."""
-    size, runs = trained.law.gain.shape[-1], corridor["runs"]
+    size, runs = trained.law.gain.shape[-1] + 1, corridor["runs"]
     levels = corridor["innovations"]["levels"]
     return {
         "levels": [Measured(low) for low in (0.0, *levels[:-1])],

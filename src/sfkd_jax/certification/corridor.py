@@ -276,7 +276,8 @@ def _observed(loop: Loop, runs: Trajectory, key: Key) -> Observed:
     keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
     spread = _spread(loop.noise, runs.states.shape[-1])[BODY]
     noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
-    return innovations(loop.model, loop.params, loop.law, runs, spread * noise)
+    given = loop.model, loop.params, loop.law, runs, spread * noise
+    return innovations(*given, loop.plant.dt)
 
 
 def _spread(noise: tuple[float, ...], size: int) -> Array:

@@ -98,6 +98,16 @@ class PathLaw(NamedTuple):
             grip=jnp.stack([slope, sharpest]),
         )
 
+    def curvature(self, steering: Scalar, speed: Scalar, env: Environment) -> Scalar:
+        """Return κ of the steady turn with this steering; NaN beyond the table."""
+        counts, ends = self.control.shape[:-1], (self.low[0], self.high[0])
+        at = jnp.concatenate([speed[None], env])
+        rows, weights = _corners(at, self.low[1:], self.high[1:], counts[1:])
+        steerings = self.control[..., 0].reshape(counts[0], -1)[:, rows] @ weights
+        beyond = {"left": jnp.nan, "right": jnp.nan}
+        turns = jnp.linspace(*ends, counts[0])
+        return jnp.interp(steering, steerings, turns, **beyond) / speed**2
+
     def __call__(
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
     ) -> Control:

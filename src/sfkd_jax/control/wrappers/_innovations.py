@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.geometry import HEADING, PathState, path_state
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.types import BODY, Control, Environment, Fiber, Model, Scalar
 
 WINDOWS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
@@ -18,22 +18,21 @@ WINDOWS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
 RELEASE = 0.7
 """Statistic below which an alarm ends: at 1 it would flicker."""
 
-Means = Float[Array, "window coordinate"]
+Means = Float[Array, "window chart"]
+Readings = Float[Array, " chart"]  # ξ, and its heading once more
 
 
 class InnovationState(NamedTuple):
     """What the test carries from one control step to the next.
 
     Attributes:
-        expected: ξ of this step, predicted from the last measured one.
-        comparable: which of its entries may be compared.
+        expected: of this step, predicted from the last measured one; NaN without.
         level: of the prediction, see `steering_level`.
         means: moving means of the scores.
         alarm: whether the last step raised or kept one.
     """
 
-    expected: PathState
-    comparable: Bool[Array, " coordinate"]
+    expected: Readings
     level: Scalar
     means: Means
     alarm: Bool[Array, ""]
@@ -50,7 +49,8 @@ class InnovationTest(NamedTuple):
     steps, and what lasts decides. The weight is that of the likelihood ratio of a
     constant error in noise whose size changes, 1/σ². Short windows detect a jump, long
     ones a drift (geometric moving averages; Roberts, 1959). Above 1 the vehicle or its
-    sensors are not those of the calibration.
+    sensors are not those of the calibration. A last chart compares the heading with the
+    steady turn that the law knows for the steering: exact where F is not.
 
     Attributes:
         levels: rising, of `steering_level`.
@@ -59,15 +59,14 @@ class InnovationTest(NamedTuple):
     """
 
     levels: Float[Array, " level"]
-    deviation: Float[Array, "level coordinate"]
+    deviation: Float[Array, "level chart"]
     threshold: Means
 
     def init(self) -> InnovationState:
         """Return the state before the first measurement."""
         size = self.deviation.shape[1]
         return InnovationState(
-            expected=jnp.zeros(size),
-            comparable=jnp.zeros(size, bool),
+            expected=jnp.full(size, jnp.nan),
             level=jnp.zeros(()),
             means=jnp.zeros((len(WINDOWS), size)),
             alarm=jnp.asarray(False),
@@ -86,23 +85,24 @@ class InnovationTest(NamedTuple):
             xi: measured.
             measured: its entries that are believed; the others are not compared.
         """
-        used = measured & state.comparable
-        innovation = jnp.where(used, xi - state.expected, 0.0)
+        seen = jnp.where(measured, xi, jnp.nan)
+        innovation = jnp.append(seen, seen[HEADING]) - state.expected
         means = self.moved(state.means, innovation, state.level)
-        # Held, not towards zero: a sensor that fails must not end an alarm.
-        means = jnp.where(used, means, state.means)
         statistic = jnp.max(jnp.abs(means) / self.threshold)
         alarm = statistic > jnp.where(state.alarm, RELEASE, 1.0)
         return state._replace(means=means, alarm=alarm), statistic
 
-    def moved(self, means: Means, innovation: PathState, level: Scalar) -> Means:
-        """Return the moving means with one more innovation."""
+    def moved(self, means: Means, innovation: Readings, level: Scalar) -> Means:
+        """Return the moving means with one more innovation, NaN without one."""
         usual = self.deviation[0]
         deviation = jax.vmap(lambda column: jnp.interp(level, self.levels, column))
-        # Of all entries: where a model errs in one, it errs in others for a while.
-        ratio = jnp.max(deviation(self.deviation.T) / usual)
-        score = innovation / (usual * jnp.maximum(ratio, 1.0) ** 2)
-        return means + jnp.asarray(WINDOWS)[:, None] * (score - means)
+        # Of all its entries: where a model errs in one, it errs in others for a while.
+        ratio = jnp.max((deviation(self.deviation.T) / usual)[:-1])
+        ratio = jnp.ones_like(usual).at[:-1].set(jnp.maximum(ratio, 1.0))
+        score = innovation / (usual * ratio**2)
+        moved = means + jnp.asarray(WINDOWS)[:, None] * (score - means)
+        # Held, not towards zero: a sensor that fails must not end an alarm.
+        return jnp.where(jnp.isnan(innovation), means, moved)
 
 
 def innovation_test(document: Mapping[str, Any]) -> InnovationTest:
@@ -118,6 +118,16 @@ def expected_coordinates(
     latent = model.encode(fiber, path_state(xi))
     after = model.step(fiber, latent, jnp.concatenate([nu, road]))
     return model.decode(fiber, after)[BODY]
+
+
+def turning_rate(
+    law: PathLaw, xi: PathState, control: Control, road: Array, env: Environment
+) -> Scalar:
+    """Return how fast e_ψ changes in the steady turn of this steering [rad/s]."""
+    # The path turns by κ a metre, counted at the foot of the car.
+    path = road[0] * jnp.cos(xi[HEADING]) / (1.0 - road[0] * xi[LATERAL])
+    turn = law.curvature(control[0], xi[PATH_SPEED], env)
+    return xi[PATH_SPEED] * (turn - path)
 
 
 def steering_level(law: PathLaw, road: Float[Array, " 2"], env: Environment) -> Scalar:
