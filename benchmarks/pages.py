@@ -151,6 +151,10 @@ def recovery():
         row = rows[car, "class"]
         return f"{row['runs_not_healthy']} of {row['runs']}; {1 - row['healthy']:.2%}"
 
+    def found(car, way):
+        row = rows[car, f"steering offset 1.0 degrees, {way}"]
+        return f"{row['within_3s']:.1%}; {row['s_99']} s"
+
     jumps, silent = ("jump", "alternating", "yaw"), ("frozen", "late", "lost")
     cells = {
         "starts that come back, law of the box alone → policy": partial(
@@ -168,6 +172,8 @@ def recovery():
             stop, friction=0.7
         ),
         "the same, friction 0.3": partial(stop, friction=0.3),
+        "steering 1° off: found in 3 s; 99 % found after": partial(found, way="law"),
+        "the same, ν of the class": partial(found, way="class"),
         "steps beyond the distance that `info` claims": beyond,
         "runs under the conditions with a flag; steps": flagged,
     }

@@ -39,6 +39,10 @@ def test_a_turn_at_a_point_of_the_tables_is_steady(derived):
     np.testing.assert_allclose(after, turn.state, atol=1e-4)
     assert float(turn.state[0]) == 0.0
     np.testing.assert_allclose(turn.state[2], 8.0)
+    # From the steering the turn is known again; beyond the table there is none.
+    known = law.curvature(turn.control[0], jnp.asarray(8.0), env)
+    np.testing.assert_allclose(known, curvature, rtol=1e-3)
+    assert np.isnan(law.curvature(jnp.asarray(1.0), jnp.asarray(8.0), env))
 
 
 @pytest.mark.parametrize("env", [(0.3, 8.0), (0.3, -8.0), (0.9, 0.0), (0.55, 5.0)])
