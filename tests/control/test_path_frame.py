@@ -87,9 +87,9 @@ def test_the_law_steers_and_brakes_against_its_errors():
     law = control.path_feedback(
         wheelbase=2.7, lateral_gain=0.03, heading_gain=0.4, speed_gain=2.0
     )
-    off = PathErrors(scalar(1.0), scalar(0.1), scalar(0.5))
+    off = PathErrors(scalar(0.4), scalar(0.1), scalar(0.5))
     np.testing.assert_allclose(
-        law(off, scalar(0.0), scalar(9.0)), [-0.03 - 0.04, -1.0], rtol=1e-5
+        law(off, scalar(0.0), scalar(9.0)), [-0.012 - 0.04, -1.0], rtol=1e-5
     )
     commanded = control.path_feedback(wheelbase=2.7, speed_gain=2.0, speed_loop=True)
     np.testing.assert_allclose(
@@ -99,7 +99,7 @@ def test_the_law_steers_and_brakes_against_its_errors():
 
 def test_near_the_path_and_above_5_m_s_the_law_is_linear_bit_for_bit():
     random = np.random.default_rng(0)
-    errors = PathErrors(*(scalar(random.uniform(-e, e, 500)) for e in (1.2, 0.2, 1.0)))
+    errors = PathErrors(*(scalar(random.uniform(-e, e, 500)) for e in control.NEAR))
     road = scalar(random.uniform(-0.02, 0.02, 500)), scalar(random.uniform(6, 13, 500))
     for loop in (False, True):
         laws = (

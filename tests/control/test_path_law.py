@@ -86,7 +86,7 @@ def test_the_law_is_linear_near_the_path_and_continuous_beyond(derived):
     turn = law.turn(*given)
     random = np.random.default_rng(0)
     xi = np.asarray(turn.state) + random.uniform(-1, 1, (300, turn.state.size)) * 0.1
-    xi[:, :2] += random.uniform(-1, 1, (300, 2)) * (0.4, 0.15)
+    xi[:, :2] += random.uniform(-1, 1, (300, 2)) * (0.35, 0.02)
     linear = jax.vmap(lambda xi: turn.control - turn.gain @ (xi - turn.state))
     np.testing.assert_array_equal(jax.vmap(turn.feedback)(xi), linear(xi))
     # Along lines out to 20 m no step is larger than its slope allows. Only where the

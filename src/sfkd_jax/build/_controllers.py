@@ -449,7 +449,7 @@ def _conditions(
             env=_box(*env), state=_box(low, high), road=_box(*road)
         )
     wide = np.full(size, np.inf)
-    wide[[LATERAL, HEADING]] = control.NEAR[0][:PATH_SPEED]
+    wide[[LATERAL, HEADING]] = control.NEAR[:PATH_SPEED]
     low, high = -wide, wide
     low[PATH_SPEED], high[PATH_SPEED] = law.low[1] - 1.0, law.high[1] + 1.0
     env = None if env_low is None or env_high is None else _box(env_low, env_high)

@@ -16,7 +16,7 @@ from sfkd_jax.control.laws._feedback import path_feedback as path_feedback
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
-from sfkd_jax.control.laws._steady_turn import NEAR as NEAR
+from sfkd_jax.control.laws._recovery import NEAR as NEAR
 from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc

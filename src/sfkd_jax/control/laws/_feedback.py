@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -13,16 +12,16 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._recovery import (
     CREEP,
+    GRIP,
     PathErrors,
-    Recovery,
+    SteadyTurn,
     holding,
     moving,
     often,
-    recovery,
+    recovering,
 )
 from sfkd_jax.control.laws._steady_turn import (
     Linearised,
-    SteadyTurn,
     by_differentiation,
     riccati_gain,
     steady_turn,
@@ -31,10 +30,6 @@ from sfkd_jax.geometry import path_step, wrap_angle
 from sfkd_jax.ranges import Positive
 from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
 
-FULL_LOCK = 0.5
-"""Steering angle that decides which arcs a car can drive [rad]."""
-GRIP = 2.5
-"""Lateral acceleration of a model's law far from the path [m/s²]."""
 PROBE = 2e-3
 """Curvature of a turn that tells how much steering a curvature takes [1/m]."""
 SHORTEST = 0.05
@@ -110,35 +105,47 @@ class LinearFeedback:
 class RecoveringFeedback(LinearFeedback):
     """`LinearFeedback` that comes back from anywhere, crawls, and stops.
 
-    Near the path and from 5 m/s on it is that law, bit for bit. Far from the path its
-    errors are those of `recovery`. Below 5 m/s it steers over a time and not over a
-    distance: K is scaled as if the car were that fast. Where the reference stands, it
-    brakes to standstill and holds the steering.
+    Near the path and from 5 m/s on it is that law, bit for bit, far from the path
+    `recovering`. Below 5 m/s it steers over a time and not over a distance: K is scaled
+    as if the car were that fast. Where the reference stands, it brakes to standstill
+    and holds the steering.
     """
 
     def __call__(self, errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
         """Return u, without any limit of the actuators."""
-        more, back = self._recovery(errors, speed)
-        lateral, heading, fast = back.errors
-        scaled = PathErrors(more**2 * lateral, more * heading, fast)
-        control = super().__call__(scaled, curvature, back.speed)
-        room = self.wheelbase * back.curvature * moving(errors.speed + speed, speed)
-        ahead = jnp.arctan(self.wheelbase * curvature)
-        steering = jnp.clip(control[0], ahead - room, ahead + room)
-        return jnp.stack([steering, control[1] - holding(errors, speed)])
+        turn = self._turn(errors, curvature, speed)
+        (ahead, base), (lateral, heading, _) = turn.control, turn.gain[0]
+        steering = ahead - lateral * errors.lateral - heading * errors.heading
+        linear = jnp.stack([steering, base - self.speed_gain * errors.speed])
+        steering, drive = recovering(
+            turn, jnp.stack(errors), linear, speed_loop=self.speed_loop
+        )
+        # From lock to lock and more, but at rest none.
+        room = jnp.pi * moving(errors.speed + speed, speed)
+        steering = jnp.clip(steering, ahead - room, ahead + room)
+        return jnp.stack([steering, drive - holding(errors, speed)])
 
     def authority(self, errors: PathErrors, speed: Scalar) -> Scalar:
-        """Return the share of a perturbation that acts, see `Recovery`."""
-        return self._recovery(errors, speed)[1].authority
+        """Return the share of a perturbation that acts, see `SteadyTurn`."""
+        turn = self._turn(errors, jnp.zeros_like(speed), speed)
+        return turn.authority(turn.state + jnp.stack(errors))
 
-    def _recovery(self, errors: PathErrors, speed: Scalar) -> tuple[Scalar, Recovery]:
-        """How much more the law steers per distance, and its errors."""
+    def _turn(self, errors: PathErrors, curvature: Scalar, speed: Scalar) -> SteadyTurn:
+        """The steady turn, with the gain of this pace."""
         more = often(jnp.maximum(errors.speed + speed, speed))
         # A car that stops does not turn towards its path in its last metre.
         more = jnp.where(speed > 0.0, more, 1.0)
-        slope = max(self.lateral_gain, 1e-6) / max(self.heading_gain, 1e-6) * more
-        tightest = math.tan(FULL_LOCK) / self.wheelbase
-        return more, recovery(errors, speed, slope=slope, tightest=tightest)
+        zero = jnp.zeros_like(speed)
+        steering = more**2 * self.lateral_gain, more * self.heading_gain, zero
+        gain = jnp.stack([*steering, zero, zero, zero + self.speed_gain])
+        return SteadyTurn(
+            jnp.stack([zero, zero, speed]),
+            jnp.stack(
+                [jnp.arctan(self.wheelbase * curvature), speed * self.speed_loop]
+            ),
+            gain.reshape(2, 3),
+            jnp.asarray([self.wheelbase, GRIP]),
+        )
 
 
 path_feedback = RecoveringFeedback
@@ -167,7 +174,7 @@ class ModelLaw(NamedTuple):
     more: what the model knows of e becomes feed-forward, and a planner samples only the
     rest. If Newton's method does not converge (the circle is too fast for the
     friction), the law is that of straight driving, gain included. Far from the path
-    it is `approach`.
+    it is `recovering`.
 
     Attributes:
         lateral: weight in the Riccati equation [1/m²].
@@ -240,17 +247,16 @@ class ModelLaw(NamedTuple):
         )
         state, control = jnp.split(chosen.both, [size], axis=1)
         # No drive where the reference stands, or the car would creep.
-        stands = reference[:, 3] == 0.0
-        control = control.at[:, 1].set(jnp.where(stands, 0.0, control[:, 1]))
+        control = control.at[:, 1].multiply(reference[:, 3] != 0.0)
         state = state.at[:, 2].set(reference[:, 3])
         # NaN compares as False.
-        wheelbase = jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST)
-        grip = jnp.stack([wheelbase, jnp.asarray(GRIP)])
+        bend = jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST)
+        grip = jnp.stack([bend, jnp.asarray(GRIP)])
         return SteadyTurn(
             state,
             control,
             jnp.broadcast_to(gain, (*control.shape, size)),
-            jnp.broadcast_to(grip, (*stands.shape, 2)),
+            jnp.broadcast_to(grip, (*control.shape[:1], 2)),
         )
 
     def control(
@@ -259,8 +265,8 @@ class ModelLaw(NamedTuple):
         state: State,
         point: Float[Array, " 4"],
         curvature: Scalar,
-    ) -> Control:
-        """Return the control at one step of the reference.
+    ) -> tuple[Control, Scalar]:
+        """Return the control at one step of the reference, and `SteadyTurn.authority`.
 
         Args:
             turn: steady turn of the step.
@@ -269,25 +275,6 @@ class ModelLaw(NamedTuple):
             curvature: of the path at `point` [1/m].
         """
         errors = path_errors(state, point, curvature)
-        pose = jnp.stack([errors.lateral, errors.heading])
-        control = turn.feedback(jnp.concatenate([pose, state[BODY]]))
-        return control.at[1].add(-holding(errors, point[3]))
-
-    def authority(
-        self,
-        turn: SteadyTurn,
-        state: State,
-        point: Float[Array, " 4"],
-        curvature: Scalar,
-    ) -> Scalar:
-        """Return the share of a perturbation that acts, see `Recovery`."""
-        errors, gain = path_errors(state, point, curvature), turn.gain[0]
-        assert turn.grip is not None
-        return recovery(
-            # From ξ*: in side wind a car on its path has a heading error.
-            errors._replace(heading=errors.heading - turn.state[1]),
-            point[3],
-            # Finite where there is no gain.
-            slope=jnp.maximum(gain[0] / (gain[1] + 1e-6), 1e-3),
-            tightest=math.tan(FULL_LOCK) / turn.grip[0],
-        ).authority
+        xi = jnp.concatenate([jnp.stack(errors[:2]), state[BODY]])
+        control = turn.feedback(xi).at[1].add(-holding(errors, point[3]))
+        return control, turn.authority(xi)

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sfkd_jax.control.laws._recovery import SteadyTurn
 from sfkd_jax.control.laws._steady_turn import (
-    SteadyTurn,
     by_differences,
     riccati_gain,
     steady_turn,
@@ -91,12 +91,8 @@ class PathLaw(NamedTuple):
         )
         tabled = jnp.clip(speed, self.low[1], self.high[1])
         slope = 0.5 * (left - right) * tabled**2 / sharpest
-        return SteadyTurn(
-            state.at[PATH_SPEED].set(speed),
-            control,
-            gain,
-            grip=jnp.stack([slope, sharpest]),
-        )
+        grip = jnp.stack([slope, sharpest])
+        return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain, grip)
 
     def curvature(self, steering: Scalar, speed: Scalar, env: Environment) -> Scalar:
         """Return κ of the steady turn with this steering; NaN beyond the table."""

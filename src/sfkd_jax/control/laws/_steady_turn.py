@@ -13,128 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, wrap_angle
-from sfkd_jax.types import Control
-
 RICCATI_STEPS = 100
 """Steps of the Riccati recursion: 10 s at 10 Hz, several times the settling time."""
 RESIDUAL_TOLERANCE = 1e-2
 """Largest residual of a valid steady turn: m, rad and m/s over one step."""
 DIFFERENCE_STEP = 3e-3
 """Step of the differences in every coordinate and control."""
-NEAR = ((0.45, 0.12, 3.0), (0.5, 0.25, 0.8))
-"""Boxes of |e_y| [m], |e_ψ| [rad] and |v − v_ref| [m/s] in which a law is linear: more
-than any model sees. Who turns hard must not accelerate hard as well.
-"""
-# The approach, chosen by a random search on both benchmark cars: how soon how many of
-# 420 starts and of 2500 random ones are back. All lengths and times scale with the law.
-ARC, CORNERING, SHARED = 0.56, 0.95, 0.55
-"""Shares of the grip that arc, steering and the turn's part of the circle may use."""
-STEEPEST, TURN = 1.5, 1.2
-"""Largest angle of approach and largest heading error that is fed back [rad]."""
-DAMPING = 2.2
-"""Of the rates of the body, relative to the linear law."""
-CIRCLE = 2.8
-"""Radius of the tightest turn, relative to d steering / d curvature."""
-SLOWER, DISTANT = (0.2, 1.0), (1.9, 14.0)
-"""Heading error [rad] and |e_y| [m] from which on the vehicle slows down, and over
-which it reaches its lowest speed.
-"""
-FASTER, BRAKING = 0.5, 1.2
-"""Largest differences of speed [m/s] that are fed back."""
 
 Derivative: TypeAlias = Callable[[Callable[[Array], Array], Array], tuple[Array, Array]]
 """(function, point) -> (value, Jacobian)."""
-
-
-class SteadyTurn(NamedTuple):
-    """Steady driving along a circle, and the feedback gain around it.
-
-    Attributes:
-        state: path coordinates ξ* = (distance left of the path, yaw relative to it,
-            body state).
-        control: u*.
-        gain: K.
-        grip: d steering / d curvature [rad m] and the lateral acceleration [m/s²] that
-            steering and braking may use far from the path; None: linear everywhere.
-    """
-
-    state: Float[Array, "*step coordinate"]
-    control: Float[Array, "*step control"]
-    gain: Float[Array, "*step control coordinate"]
-    grip: Float[Array, "*step 2"] | None = None
-
-    def feedback(self, coordinates: PathState) -> Control:
-        """Return the control of the whole plane, without the limits of the actuators.
-
-            u = u* − K (ξ − ξ*)   in one of the boxes `NEAR`
-
-        At twice that distance and beyond it is `approach`, in between a mixture.
-        """
-        # Relative to ξ*, not to 0: in side wind a car on its path has a heading error.
-        linear = self.control - self.gain @ (coordinates - self.state)
-        if self.grip is None:
-            return linear
-        errors = jnp.abs(coordinates[: PATH_SPEED + 1] - self.state[: PATH_SPEED + 1])
-        away = jnp.min(jnp.max(errors / jnp.asarray(NEAR), axis=1))
-        share = jnp.clip(away - 1.0, 0.0, 1.0)
-        far = approach(self, self.grip, coordinates)
-        # A choice, not a mixture with weight 0: near the path the law is bit for bit
-        # the linear one, around which models are learned and certified.
-        return jnp.where(share > 0.0, linear + share * (far - linear), linear)
-
-
-def approach(
-    turn: SteadyTurn, grip: Float[Array, " 2"], coordinates: PathState
-) -> Control:
-    """Return the control far from the path, which brings the vehicle back to it.
-
-        ψ* = −sign(e_y) min(K_y/K_ψ |e_y|, √(2 |e_y| / R), `STEEPEST`),   R ~ v²/a
-        δ = u*_δ − K_ψ sat(e_ψ − ψ*) − K_r r,   |δ| ≤ (dδ/dκ) a / v²
-
-    Near the path ψ* is that of the linear law; farther away the vehicle can turn in on
-    an arc of radius R. It is slower, the more it has to turn, and speeds up once it
-    points the right way; steering and drive share the grip a.
-
-    Args:
-        turn: whose state, control and gain are used.
-        grip: see `SteadyTurn`.
-        coordinates: ξ.
-    """
-    errors = coordinates - turn.state
-    slope, available = grip[0], grip[1]
-    speed = jnp.maximum(jnp.abs(coordinates[PATH_SPEED]), 1.0)
-    sideways, radius = jnp.abs(errors[LATERAL]), speed**2 / (ARC * available)
-    steering, drive = turn.gain[0], turn.gain[1]
-
-    # A law that does not steer has no approach.
-    ratio = steering[LATERAL] / jnp.maximum(steering[HEADING], 1e-6)
-    linear = ratio * sideways
-    angle = jnp.minimum(
-        jnp.minimum(linear, jnp.sqrt(2.0 * sideways / radius)), STEEPEST
-    )
-    turned = wrap_angle(errors[HEADING] + jnp.sign(errors[LATERAL]) * angle)
-    # Feed-forward helps along the path only; the rates of the body damp a slide.
-    ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
-    rest = steering[PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
-    wanted = ahead - steering[HEADING] * jnp.clip(turned, -TURN, TURN) - DAMPING * rest
-    most = slope * CORNERING * available / speed**2 + 0.01
-    wanted = jnp.clip(wanted, -most, most)
-
-    reference = turn.state[PATH_SPEED]
-    slow = jnp.minimum(reference, jnp.sqrt(CIRCLE * slope * available))
-    astray = jnp.clip((jnp.abs(turned) - SLOWER[0]) / SLOWER[1], 0.0, 1.0)
-    away = jnp.clip((sideways - DISTANT[0]) / DISTANT[1], 0.0, 1.0)
-    target = reference + (slow - reference) * jnp.maximum(astray, away)
-    # What cornering uses of the friction circle is missing for the drive.
-    used = jnp.clip(jnp.abs(wanted) * speed**2 / (slope * available), 0.0, 1.0)
-    left = jnp.sqrt(1.0 - SHARED * used**2)
-    error = jnp.clip(
-        coordinates[PATH_SPEED] - target,
-        -FASTER * left * (1.0 - astray),
-        BRAKING * left,
-    )
-    return jnp.stack([wanted, turn.control[1] - drive[PATH_SPEED] * error])
 
 
 class Linearised(NamedTuple):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.laws._steady_turn import SteadyTurn
+from sfkd_jax.control.laws._recovery import SteadyTurn
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._path_tracking import LawTask, StageInputs, check_path
 from sfkd_jax.control.tasks._task import (

@@ -247,7 +247,7 @@ class PathTracking(LawTask):
             turns = law.prepare(model, fiber, observation, reference, curvature)
         targets = PathTarget(reference, curvature, turns)
         first = jax.tree.map(lambda leaf: leaf[0], targets)
-        law_control = self._law_control(observation, first)
+        law_control, _ = self._law_control(observation, first)
         # At the first step no control is known: assume that the law has driven.
         before = jnp.where(previous.known, previous.control, law_control)
         latent = model.encode(fiber, observation)
@@ -268,9 +268,8 @@ class PathTracking(LawTask):
     ) -> StepResult:
         """Return one step of one rollout: law, perturbation, limits, model, cost."""
         model, point = self.model, target.point
-        law_control = self._law_control(before.state, target)
-        nu = admitted(nu, before.state[3], point[3])
-        nu = nu * self._authority(before.state, target)
+        law_control, authority = self._law_control(before.state, target)
+        nu = admitted(nu, before.state[3], point[3]) * authority
         control = self.limit(law_control + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)
@@ -281,28 +280,23 @@ class PathTracking(LawTask):
         sample = PathSample(latent, after, errors, control)
         return StepResult(sample, cost, control, control - law_control, after)
 
-    def _law_control(self, state: State, target: PathTarget) -> Control:
-        """The control of the law, clipped to the limits.
+    def _law_control(self, state: State, target: PathTarget) -> tuple[Control, Scalar]:
+        """The control of the law, clipped to the limits, and its planner's authority.
 
         Without the clip, a perturbation would compensate for what the law requests
         beyond the limits. After a far-off observation that is thousands of radians, and
         it would stay in the plan when the observations are right again.
         """
         point, curvature, law = target.point, target.curvature, self.law
+        authority = jnp.ones(())
         if isinstance(law, ModelLaw):
-            control = law.control(target.turn, state, point, curvature)
+            control, authority = law.control(target.turn, state, point, curvature)
         else:
-            control = law(path_errors(state, point, curvature), curvature, point[3])
-        return jnp.clip(control, *self.box())
-
-    def _authority(self, state: State, target: PathTarget) -> Scalar | float:
-        """The share of a perturbation that acts: none where the law has to turn."""
-        point, curvature, law = target.point, target.curvature, self.law
-        if isinstance(law, ModelLaw):
-            return law.authority(target.turn, state, point, curvature)
-        if isinstance(law, RecoveringFeedback):
-            return law.authority(path_errors(state, point, curvature), point[3])
-        return 1.0
+            errors = path_errors(state, point, curvature)
+            control = law(errors, curvature, point[3])
+            if isinstance(law, RecoveringFeedback):
+                authority = law.authority(errors, point[3])
+        return jnp.clip(control, *self.box()), authority
 
 
 path_tracking = factory(PathTracking, lambda around: around.task(check_path))
