@@ -168,7 +168,7 @@ class Policy(TrainedModel):
         return _entrance(guard if along_path else behind(guard, planner), self)
 
     def in_lane(
-        self, *, car: tuple[float, float] = (4.5, 1.8), planner: str = "mppi"
+        self, *, car: tuple[float, float] = (4.5, 2.0), planner: str = "mppi"
     ) -> Controller:
         """Return a controller that drives in a lane, round obstacles, see `InLane`.
 

@@ -269,6 +269,11 @@ class ControllerInfo(TypedDict, total=False):
     braking: Bool[Array, ""]  # the planner brakes beyond the class
     rolling: Scalar  # part of the corridor from below its slowest speed [m]
     shield_healthy: Bool[Array, ""]  # there is a corridor
+    # InLane
+    reference: Reference  # the window that is followed
+    offset: Scalar  # of the reference from the centre line [m]
+    admissible: Bool[Array, ""]  # the committed reference is in its class, and free
+    stopping: Bool[Array, ""]  # it ends at rest
     # a course with obstacles
     clearance: Scalar  # claimed distance from obstacles [m]; NaN where none is
     gap: Scalar  # their true distance, as a simulation knows it [m]

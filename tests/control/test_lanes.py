@@ -10,14 +10,21 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import control
-from sfkd_jax.control.lanes._reference import SPLICE, curve, road_ahead
+from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
 from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic
 from sfkd_jax.types import Controller
 
 MOVE = jit(quintic)
-KIND = control.Class(curvature=0.02, turning=0.0025, lateral=2.0, speed=(8.0, 10.5))
-BODY = control.Body(half=(2.25, 0.9), corridor=0.14, heading=0.05)
+KIND = control.Class(
+    curvature=0.02,
+    turning=0.0025,
+    lateral=2.0,
+    speed=(8.0, 10.5),
+    half=(2.25, 0.9),
+    corridor=0.14,
+    heading=0.05,
+)
 SAMPLES, DT = 200, 0.1
 
 
@@ -97,7 +104,8 @@ def road():
 def test_curvature_beside_a_road_is_that_of_the_positions(road):
     ahead = road_ahead(road, jnp.asarray(100), 400, (1.0, 1.0))
     move = MOVE(jnp.zeros(3), 3.0, 40.0, 0.5 * jnp.arange(400.0) - 60.0)[:3]
-    along = jax.tree.map(np.asarray, curve(ahead, move))
+    plan = Committed(jnp.asarray(100), move, jnp.full(400, 100.0))
+    along = jax.tree.map(np.asarray, curve(ahead, plan))
     x, y = np.asarray(along.position, np.float64)
     step = np.hypot(np.diff(x), np.diff(y))
     yaw = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
@@ -118,27 +126,26 @@ def follower():
     """A controller that reports the window it is given, and a certain corridor."""
 
     def act(params, state, observation, env, reference):
-        info = {"healthy": jnp.asarray(True), "corridor": jnp.asarray(BODY.corridor)}
+        info = {"healthy": jnp.asarray(True), "corridor": jnp.asarray(KIND.corridor)}
         return jnp.zeros(2), state, info
 
     return Controller(lambda key: jnp.zeros(()), act)
 
 
-@pytest.fixture(scope="module", params=["mppi", "cem"])
-def lane(request):
-    task = control.Manoeuvres(kind=KIND, body=BODY, dt=DT)
+def lane_with(planner, **settings):
+    """The controller of a lane, and its step as one program."""
+    task = control.Manoeuvres(kind=KIND, dt=DT)
     search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
-    settings = {"num_samples": 100}
-    settings |= (
-        {"iterations": 2, "elites": 10}
-        if request.param == "cem"
-        else {"effective_samples": 5.0}
-    )
-    planner = getattr(control, request.param)(task.task(), **search, **settings)
+    search = planner(task.task(), **search, **settings)
     driver = control.in_lane(
-        inner=follower(), planner=planner, manoeuvres=task, dt=DT, horizon=20
+        inner=follower(), planner=search, manoeuvres=task, dt=DT, horizon=20
     )
     return driver, jit(driver.act)
+
+
+@pytest.fixture(scope="module")
+def lane():
+    return lane_with(control.mppi, num_samples=100, effective_samples=5.0)
 
 
 def drive(lane, road, seen, steps, *, speed=10.0, friction=0.9):
@@ -169,10 +176,13 @@ def room(car, posts):
     """Distance of a car from the nearest of them [m]."""
     faces = jnp.stack([jnp.cos(car[2]), jnp.sin(car[2])])
     where = jnp.asarray(car[:2])
-    return float(clearance(posts, where, direction=faces, half=BODY.half).min())
+    return float(clearance(posts, where, direction=faces, half=KIND.half).min())
 
 
-def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road):
+@pytest.mark.parametrize("planner", ["mppi", "cem"])
+def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, planner):
+    if planner == "cem":
+        lane = lane_with(control.cem, num_samples=50, iterations=2, elites=5)
     posts = circles(beside(road, POSTS), 0.8)
 
     def seen(number, car):
@@ -184,7 +194,7 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road):
     cars = np.stack([car for car, _, _ in rows]).astype(np.float64)
     rooms = [room(car, posts) for car in cars]
     claims = np.array([info["clearance"] for _, _, info in rows])
-    assert min(rooms) > BODY.margin
+    assert min(rooms) > KIND.margin
     # What is claimed is about a car anywhere in the corridor.
     visible = [room(car, seen(0, car)) for car in cars]
     assert np.all(claims <= np.array(visible) + 1e-3)

@@ -391,14 +391,11 @@ def build_in_lane(
         turning=turning,
         lateral=min(under["lateral_acceleration"], float(law.high[0])),
         speed=(road[0][REFERENCE_SPEED], road[1][REFERENCE_SPEED]),
-    )
-    heading = 0.0 if state is None else max(abs(end[HEADING]) for end in state)
-    body = control.Body(
         half=(0.5 * car[0], 0.5 * car[1]),
         corridor=corridor["corridor_m"],
-        heading=heading,
+        heading=0.0 if state is None else max(abs(end[HEADING]) for end in state),
     )
-    manoeuvres = control.Manoeuvres(kind=kind, body=body, dt=plant.dt)
+    manoeuvres = control.Manoeuvres(kind=kind, dt=plant.dt)
     search = PLANNERS[planner](manoeuvres.task(), **SEARCH, **SEARCHES.get(planner, {}))
     return control.in_lane(
         inner=inner,

@@ -3,7 +3,6 @@
 from sfkd_jax.control._factory import factory as factory
 from sfkd_jax.control.lanes._in_lane import InLane as InLane
 from sfkd_jax.control.lanes._in_lane import in_lane as in_lane
-from sfkd_jax.control.lanes._manoeuvre import Body as Body
 from sfkd_jax.control.lanes._manoeuvre import Class as Class
 from sfkd_jax.control.lanes._manoeuvre import Manoeuvres as Manoeuvres
 from sfkd_jax.control.laws._feedback import FeedbackLaw as FeedbackLaw

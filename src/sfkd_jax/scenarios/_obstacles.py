@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.lanes import Lane, Obstacles, circles, lane_along, outside_box
+from sfkd_jax.lanes import Lane, Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import SPACING, Path, point_at
 from sfkd_jax.types import Key, Scalar, State
 
@@ -110,7 +110,5 @@ def car_clearance(obstacles: Obstacles, state: State) -> Scalar:
         obstacles: circles, where they are now.
         state: of the car, whose position is the middle of a box of `CAR`.
     """
-    count = obstacles.radius.shape[0]
-    yaw, half = jnp.full(count, state[2]), jnp.tile(jnp.asarray(CAR), (count, 1))
-    apart = outside_box(obstacles.at(0.0) - state[:2], yaw, half) - obstacles.radius
-    return jnp.min(jnp.where(obstacles.present, apart, jnp.inf))
+    direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
+    return jnp.min(clearance(obstacles, state[:2], direction=direction, half=CAR))

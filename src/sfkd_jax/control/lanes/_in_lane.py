@@ -148,7 +148,7 @@ class InLane:
         state, road = self._located(state, observation, lane)
         situation = self._situation(state, road, obstacles, env)
         kept = task.judge(weights, situation, state.committed)
-        free = task.free(kept) & clean
+        free = ~jnp.any(kept.blocked) & clean
         # What was committed is judged at every step: what appears is seen at once.
         due = (state.wait <= 0) | ~free
         planner, committed = jax.lax.cond(
@@ -161,7 +161,7 @@ class InLane:
         ahead = window(
             lane.path,
             committed,
-            judged.timing,
+            judged.curve,
             place,
             dt=self.dt,
             horizon=self.horizon,
@@ -170,7 +170,7 @@ class InLane:
             params, state.inner, observation, env, ahead
         )
         # What was needed is the corridor of the certificate; here is that of the step.
-        room = jnp.min(judged.gap) + task.body.corridor
+        room = jnp.min(judged.gap) + task.kind.corridor
         room = room - info.get("corridor", jnp.nan)
         report: Any = {
             **info,
@@ -178,8 +178,8 @@ class InLane:
             "reference": ahead,
             "offset": jnp.interp(place, jnp.arange(self.samples), committed.move[0]),
             "clearance": jnp.where(clean, room, jnp.nan),
-            "admissible": (task.violation(judged) <= 0.0) & clean,
-            "stopping": ~judged.timing.reached[-1],
+            "admissible": (judged.violation <= 0.0) & clean,
+            "stopping": ~judged.curve.reached[-1],
         }
         wait = jnp.where(due, self.period, state.wait) - 1
         after = state._replace(
@@ -258,11 +258,11 @@ class InLane:
         row, after, info = act(None, planner, situation, None, None)
         found = task.reference(situation, row)
         better = info["mean_cost"] < (1.0 - self.better) * kept.cost
-        better |= task.violation(kept) > 0.0
+        better |= kept.violation > 0.0
         # A plan that continues an old one is not the one that was evaluated.
         taken = better & info["healthy"] & info["constraints_kept"] & clean
         stop = task.stop(situation, kept, clean)
-        stays = task.free(kept) & clean
+        stays = ~jnp.any(kept.blocked) & clean
         otherwise = jax.tree.map(partial(jnp.where, stays), before, stop)
         return after, jax.tree.map(partial(jnp.where, taken), found, otherwise)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,10 +16,8 @@ from sfkd_jax.control.lanes._reference import (
     Committed,
     Curve,
     RoadAhead,
-    Timing,
     curve,
     speed_profile,
-    timing,
 )
 from sfkd_jax.control.tasks._task import (
     PlanningStart,
@@ -41,13 +40,16 @@ LATE = 0.03
 
 @dataclass(frozen=True, kw_only=True)
 class Class:
-    """The references of which a corridor was certified.
+    """The references of which a corridor was certified, and the car that follows them.
 
     Attributes:
         curvature: largest [1/m].
         turning: largest change of the curvature per length [1/m²].
         lateral: largest v² κ [m/s²].
         speed: lowest and highest [m/s].
+        half: half of the length and width of the car [m].
+        corridor: bound of |e_y| [m].
+        heading: bound of |e_ψ| [rad].
         acceleration: largest [m/s²].
         deceleration: largest in a planned change of speed [m/s²].
     """
@@ -56,36 +58,19 @@ class Class:
     turning: Positive
     lateral: Positive
     speed: Span
+    half: tuple[Positive, Positive]
+    corridor: NonNegative
+    heading: NonNegative
     acceleration: Positive = 0.5
     deceleration: Positive = 1.0
 
     def __post_init__(self) -> None:
         check_intervals(self)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Body:
-    """The car as a box around its reference point, and what it may be off by.
-
-    Attributes:
-        half: half of its length and width [m].
-        corridor: bound of |e_y| [m].
-        heading: bound of |e_ψ| [rad].
-    """
-
-    half: tuple[Positive, Positive]
-    corridor: NonNegative
-    heading: NonNegative
-
     @property
     def margin(self) -> float:
-        """What a point of the box may be off to the side [m]."""
-        return self.corridor + self.swing
-
-    @property
-    def swing(self) -> float:
-        """What the heading moves its ends to the side [m]."""
-        return self.half[0] * self.heading
+        """What any point of the car is off at most [m]."""
+        return self.corridor + math.hypot(*self.half) * self.heading
 
 
 class Situation(NamedTuple):
@@ -112,10 +97,9 @@ class Judged(NamedTuple):
     Attributes:
         cost: to be compared with those of others.
         outside: how far it leaves the class, relative; not above 0 inside.
-        gap: smallest distance from obstacles [m], less nothing, (sample,).
-        edge: smallest distance from the edges, less the corridor [m], (sample,).
+        gap: what obstacles leave beyond what is needed [m], (sample,).
+        edge: what the edges leave [m], (sample,).
         curve: in the world.
-        timing: along it.
     """
 
     cost: Scalar
@@ -123,7 +107,17 @@ class Judged(NamedTuple):
     gap: Float[Array, " sample"]
     edge: Float[Array, " sample"]
     curve: Curve
-    timing: Timing
+
+    @property
+    def blocked(self) -> Bool[Array, " sample"]:
+        """Where it comes too near to something; NaN does."""
+        return ~(jnp.minimum(self.gap, self.edge) >= 0.0)
+
+    @property
+    def violation(self) -> Scalar:
+        """How far it is from being admissible, 0 if it is."""
+        room = jnp.min(jnp.minimum(self.gap, self.edge))
+        return jnp.maximum(jnp.maximum(self.outside, -room), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +136,7 @@ class Manoeuvres:
     comes too near to an obstacle violates the constraint.
 
     Attributes:
-        kind: the references of which a corridor was certified.
-        body: of the car.
+        kind: what is admissible.
         dt: sampling period of the obstacles [s].
         widest: largest offset from the centre line [m].
         comfort: distance from obstacles beyond what is needed [m].
@@ -152,7 +145,6 @@ class Manoeuvres:
     """
 
     kind: Class
-    body: Body
     dt: Positive
     widest: Positive = 5.0
     comfort: Positive = 0.5
@@ -196,7 +188,7 @@ class Manoeuvres:
         """Return the cost of one row and its violation in place of a state."""
         del target, at
         judged = self.judge(weights, situation, self.reference(situation, row))
-        return StepResult(sample, judged.cost, row, row, self.violation(judged))
+        return StepResult(sample, judged.cost, row, row, judged.violation)
 
     def reference(self, situation: Situation, row: Control) -> Committed:
         """Return the reference of a row of parameters."""
@@ -238,7 +230,7 @@ class Manoeuvres:
         bend = start * jnp.abs(judged.curve.curvature[BEHIND])
         grip = jnp.sqrt(jnp.maximum(situation.grip**2 - bend**2, 0.01))
         gentle = jnp.minimum(self.kind.deceleration, grip)
-        until = jnp.where(clean, jnp.argmax(self.blocked(judged)), 0)
+        until = jnp.where(clean, jnp.argmax(judged.blocked), 0)
         until = until * spacing - self.standoff
         left = jnp.maximum(until - situation.place * spacing, 1e-3)
         needed = jnp.clip(0.5 * start / left, gentle, grip)
@@ -251,78 +243,52 @@ class Manoeuvres:
 
     def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
         """Return what a reference costs, how far it leaves the class, and its room."""
-        road, kind = situation.road, self.kind
-        along, spacing = curve(road, plan.move), road.spacing
-        when = timing(along.stretch, plan.square, spacing)
-        late = slice(SPLICE, None)
-        curvature, square = along.curvature, plan.square
-        turning = jnp.diff(curvature) / when.lengths
-        # What is behind the splice cannot be changed any more.
+        road, kind, square = situation.road, self.kind, plan.square
+        along = curve(road, plan)
+        curvature = along.curvature
+        turning = jnp.append(jnp.diff(curvature) / along.lengths, 0.0)
         shares = jnp.stack(
             [
                 jnp.abs(curvature) / kind.curvature,
+                jnp.abs(turning) / kind.turning,
                 square * jnp.abs(curvature) / jnp.minimum(kind.lateral, situation.grip),
                 square / kind.speed[1] ** 2,
-                jnp.abs(jnp.append(turning, 0.0)) / kind.turning,
                 jnp.where(along.scale < SMALLEST_SCALE, 2.0, 0.0),
             ]
         )
-        outside = jnp.max(jnp.where(when.reached, shares, 0.0)[:, late]) - 1.0
-        gap = self._gap(situation, along, when)
-        edge = self._edge(road, plan.move, along, when)
-        wanted = jnp.sqrt(road.wanted)
+        # What is before the splice cannot be changed any more.
+        outside = jnp.max(jnp.where(along.reached, shares, 0.0)[:, SPLICE:]) - 1.0
+        gap, edge = self._room(situation, plan.move, along)
         costs = jnp.stack(
             [
                 plan.move[0] ** 2,
                 (curvature - road.curvature) ** 2,
-                jnp.append(turning, 0.0) ** 2,
-                (wanted - jnp.sqrt(square)) ** 2,
+                turning**2,
+                (jnp.sqrt(road.wanted) - jnp.sqrt(square)) ** 2,
                 jnp.clip(self.comfort - gap, 0.0, self.comfort) ** 2,
             ]
         )
-        cost = spacing * jnp.sum(weights @ costs[:, BEHIND:])
-        return Judged(cost, outside, gap, edge, along, when)
+        cost = road.spacing * jnp.sum(weights @ costs[:, BEHIND:])
+        return Judged(cost, outside, gap, edge, along)
 
-    def free(self, judged: Judged) -> Bool[Array, ""]:
-        """Whether a reference keeps its distance from obstacles and edges."""
-        return ~jnp.any(self.blocked(judged))
-
-    def blocked(self, judged: Judged) -> Bool[Array, " sample"]:
-        """Where a reference comes too near to something; NaN does."""
-        return ~(jnp.minimum(judged.gap, judged.edge) >= 0.0)
-
-    def violation(self, judged: Judged) -> Scalar:
-        """Return how far a reference is from being admissible, 0 if it is."""
-        room = jnp.minimum(jnp.min(judged.gap), jnp.min(judged.edge))
-        return jnp.maximum(jnp.maximum(judged.outside, -room), 0.0)
-
-    def _gap(
-        self, situation: Situation, along: Curve, when: Timing
-    ) -> Float[Array, " sample"]:
-        """Distance from obstacles beyond what is needed [m], (sample,)."""
-        now = jnp.interp(situation.place, jnp.arange(when.times.size), when.times)
-        steps = (when.times - now) / self.dt
-
-        half = self.body.half
-        where, facing = along.position[:, BEHIND:], along.direction[:, BEHIND:]
-        later = steps[BEHIND:]
+    def _room(
+        self, situation: Situation, move: Float[Array, "3 sample"], along: Curve
+    ) -> list[Float[Array, " sample"]]:
+        """What obstacles and edges leave beyond what is needed [m]."""
+        road, half = situation.road, self.kind.half
+        samples = jnp.arange(along.times.shape[0])
+        now = jnp.interp(situation.place, samples, along.times)
+        steps = jnp.maximum(along.times - now, 0.0) / self.dt
+        pose = along.position, steps, along.direction, half
 
         # One after the other: all samples of all plans are then one long loop.
         def nearer(before: Array, one: Obstacles) -> tuple[Array, None]:
-            return jnp.minimum(before, distance(one, where, later, facing, half)), None
+            return jnp.minimum(before, distance(one, *pose)), None
 
-        nearest = jnp.full(later.shape, jnp.inf)
-        nearest, _ = jax.lax.scan(nearer, nearest, situation.obstacles)
-        nearest = jnp.where(when.reached[BEHIND:], nearest, jnp.inf)
-        passed = jnp.full(BEHIND, jnp.inf)
-        return jnp.concatenate([passed, nearest - self.body.margin - LATE])
-
-    def _edge(
-        self, road: RoadAhead, move: Array, along: Curve, when: Timing
-    ) -> Float[Array, " sample"]:
-        """Distance from the edges beyond what is needed [m], (sample,)."""
-        length, width = self.body.half
-        aside = length * jnp.abs(move[1]) / along.stretch + width + self.body.margin
-        room = jnp.minimum(road.left - move[0], road.right + move[0]) - aside
-        beyond = jnp.arange(move.shape[1]) < BEHIND
-        return jnp.where(beyond | ~when.reached, jnp.inf, room)
+        gap = jnp.full(samples.shape, jnp.inf)
+        gap, _ = jax.lax.scan(nearer, gap, situation.obstacles)
+        edge = jnp.minimum(road.left - move[0], road.right + move[0])
+        edge = edge - half[1] - half[0] * jnp.abs(move[1]) / along.stretch
+        counts = along.reached & (samples >= BEHIND)
+        room = gap - LATE, edge
+        return [jnp.where(counts, one - self.kind.margin, jnp.inf) for one in room]

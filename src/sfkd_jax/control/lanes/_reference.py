@@ -81,7 +81,7 @@ class RoadAhead(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A reference in the world, at the samples of the road.
+    """A reference in the world and in time, at the samples of the road.
 
     Attributes:
         position: [m], (2, sample).
@@ -89,6 +89,9 @@ class Curve(NamedTuple):
         curvature: of the curve itself [1/m].
         stretch: its length per length of the road.
         scale: 1 − κ d; below 0.2 the offset reaches the centre of the bend.
+        lengths: from each sample to the next [m].
+        times: when it is there, from the first sample on [s].
+        reached: whether it ever is.
     """
 
     position: Float[Array, "2 sample"]
@@ -96,6 +99,9 @@ class Curve(NamedTuple):
     curvature: Float[Array, " sample"]
     stretch: Float[Array, " sample"]
     scale: Float[Array, " sample"]
+    lengths: Float[Array, " gap"]
+    times: Float[Array, " sample"]
+    reached: Bool[Array, " sample"]
 
 
 def road_ahead(
@@ -138,29 +144,35 @@ def road_ahead(
     )
 
 
-def curve(road: RoadAhead, move: Float[Array, "3 sample"]) -> Curve:
-    """Return an offset curve in the world, exact.
+def curve(road: RoadAhead, plan: Committed) -> Curve:
+    """Return a reference in the world, exact beside its road.
 
-        p = p_r + d n,   dp/ds = (1 − κ_r d) t + d' n,   κ = dψ/ds / |dp/ds|
-        dψ/ds = κ_r + (d'' (1 − κ_r d) + d' (κ_r' d + κ_r d')) / |dp/ds|²
-
-    Args:
-        road: κ_r and its frames.
-        move: d, d', d''.
+    p = p_r + d n,   dp/ds = (1 − κ_r d) t + d' n,   κ = dψ/ds / |dp/ds|
+    dψ/ds = κ_r + (d'' (1 − κ_r d) + d' (κ_r' d + κ_r d')) / |dp/ds|²
     """
-    d, first, second = move
+    d, first, second = plan.move
     bend, (cos, sin) = road.curvature, road.direction
     scale = 1.0 - bend * d
     square = scale**2 + first**2
     stretch = jnp.sqrt(square)
     turn = bend + (second * scale + first * (road.slope * d + bend * first)) / square
     forward, aside = scale / stretch, first / stretch
+    lengths = 0.5 * road.spacing * (stretch[1:] + stretch[:-1])
+    speed = jnp.sqrt(plan.square)
+    both = speed[1:] + speed[:-1]
+    # Where it stands it stays: hours, and not infinity, of which sums make NaN.
+    gaps = 2.0 * lengths / jnp.maximum(both, STANDS)
+    # Behind the car it has been.
+    stood = (both <= STANDS) & (jnp.arange(both.shape[0]) >= BEHIND)
     return Curve(
         position=road.position + d * jnp.stack([-sin, cos]),
         direction=jnp.stack([forward * cos - aside * sin, forward * sin + aside * cos]),
         curvature=turn / stretch,
         stretch=stretch,
         scale=scale,
+        lengths=lengths,
+        times=jnp.concatenate([jnp.zeros(1), jnp.cumsum(gaps)]),
+        reached=jnp.concatenate([jnp.asarray([True]), jnp.cumsum(stood) == 0]),
     )
 
 
@@ -186,46 +198,10 @@ def speed_profile(
     return jnp.maximum(jnp.clip(most, slowest, fastest), 0.0)
 
 
-class Timing(NamedTuple):
-    """When a reference is where.
-
-    Attributes:
-        times: from the first sample on [s], (sample,).
-        lengths: of the curve from each sample to the next [m], (sample − 1,).
-        reached: whether the car ever comes there, (sample,).
-    """
-
-    times: Float[Array, " sample"]
-    lengths: Float[Array, " gap"]
-    reached: Bool[Array, " sample"]
-
-
-def timing(
-    stretch: Float[Array, " sample"], square: Float[Array, " sample"], spacing: Scalar
-) -> Timing:
-    """Return when a reference passes its samples.
-
-    Args:
-        stretch: length of the curve per length of the road.
-        square: v² [m²/s²].
-        spacing: of the samples [m].
-    """
-    speed = jnp.sqrt(square)
-    lengths = 0.5 * spacing * (stretch[1:] + stretch[:-1])
-    both = speed[1:] + speed[:-1]
-    # Where it stands it stays: hours, and not infinity, of which sums make NaN.
-    gaps = 2.0 * lengths / jnp.maximum(both, STANDS)
-    times = jnp.concatenate([jnp.zeros(1), jnp.cumsum(gaps)])
-    # Behind the car it has been.
-    stood = (both <= STANDS) & (jnp.arange(both.shape[0]) >= BEHIND)
-    reached = jnp.concatenate([jnp.asarray([True]), jnp.cumsum(stood) == 0])
-    return Timing(times, lengths, reached)
-
-
 def window(
     path: Path,
     committed: Committed,
-    when: Timing,
+    along: Curve,
     place: Scalar,
     *,
     dt: float,
@@ -236,35 +212,35 @@ def window(
     Args:
         path: that the reference is beside.
         committed: the reference.
-        when: its timing.
+        along: the same in the world.
         place: of the car, in samples from the first one.
         dt: sampling period [s].
         horizon: number of points, the first one dt ahead.
     """
     squares, spacing = committed.square, path.spacing
     speed = jnp.sqrt(squares)
-    slopes = 0.5 * jnp.diff(squares) / when.lengths
+    slopes = 0.5 * jnp.diff(squares) / along.lengths
     last = squares.shape[0] - 2
     # When the reference was where the car is, from the start of its cell on.
     here = jnp.clip(jnp.floor(place).astype(int), 0, last)
-    passed = (place - here) * when.lengths[here]
+    passed = (place - here) * along.lengths[here]
     now = jnp.sqrt(jnp.maximum(squares[here] + 2.0 * slopes[here] * passed, 0.0))
     since = 2.0 * passed / jnp.maximum(speed[here] + now, STANDS)
-    times = when.times[here] + since + dt * jnp.arange(1, horizon + 1)
+    times = along.times[here] + since + dt * jnp.arange(1, horizon + 1)
 
     def point(time: Scalar) -> Float[Array, " 4"]:
-        at = jnp.clip(jnp.searchsorted(when.times, time, side="right") - 1, 0, last)
-        later = time - when.times[at]
-        along = speed[at] * later + 0.5 * slopes[at] * later**2
-        along = jnp.clip(along, 0.0, when.lengths[at])
-        share = along / when.lengths[at]
+        at = jnp.clip(jnp.searchsorted(along.times, time, side="right") - 1, 0, last)
+        later = time - along.times[at]
+        gone = speed[at] * later + 0.5 * slopes[at] * later**2
+        gone = jnp.clip(gone, 0.0, along.lengths[at])
+        share = gone / along.lengths[at]
         d, first, second = committed.move[:, at]
         third = (committed.move[2, at + 1] - second) / spacing
         h = share * spacing
         offset = d + h * (first + h * (second / 2.0 + h * third / 6.0))
         slope = first + h * (second + h * third / 2.0)
         x, y, yaw, bend = point_at(path, (committed.index + at + share) * spacing)
-        square = jnp.maximum(squares[at] + 2.0 * slopes[at] * along, 0.0)
+        square = jnp.maximum(squares[at] + 2.0 * slopes[at] * gone, 0.0)
         return jnp.stack(
             [
                 x - offset * jnp.sin(yaw),
