@@ -204,10 +204,10 @@ def test_under_brax_wrappers_episodes_end_in_time_and_begin_again():
     [
         ({"vehicle": "boat"}, "unknown vehicle 'boat'; choose one of dynamic"),
         ({"scenario": "s9"}, "unknown scenario 's9'"),
-        ({"duration": 0.05}, "duration must be finite and at least one step"),
-        ({"preview": 0}, "preview must be a whole number of at least 1"),
-        ({"lane": 0.0}, "lane must be positive"),
-        ({"leaving": float("nan")}, "leaving must be finite and at least 0"),
+        ({"duration": 0.05}, "duration must be at least a step"),
+        ({"preview": 0}, r"preview must be in \[1, inf\), got 0"),
+        ({"lane": 0.0}, r"lane must be in \(0, inf\)"),
+        ({"leaving": float("nan")}, r"leaving must be in \[0, inf\), got nan"),
         (
             {"vehicle": "dynamic", "scenario": "family"},
             r"the scenario starts in a state of shape \(4,\), 'dynamic'",

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sfkd_jax import build
 from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
+from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
 from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
 from sfkd_jax.types import (
     BODY,
@@ -99,31 +100,19 @@ class DrivingTask:
     vehicle: str | Vehicle = "kinematic"
     scenario: str | Family = "s1"
     inner_loop: str = "none"
-    duration: float = 60.0
-    preview: int = 10
-    lane: float = 3.0
-    lateral: float = 200.0
-    speed: float = 1.0
-    steering_rate: float = 5.0
-    leaving: float = 2e4
+    duration: Positive = 60.0
+    preview: AtLeastOne = 10
+    lane: Positive = 3.0
+    lateral: NonNegative = 200.0
+    speed: NonNegative = 1.0
+    steering_rate: NonNegative = 5.0
+    leaving: NonNegative = 2e4
 
     def __post_init__(self) -> None:
         """Check the settings, and that scenario and plant fit."""
-        for name in ("lateral", "speed", "steering_rate", "leaving"):
-            if not (math.isfinite(weight := getattr(self, name)) and weight >= 0):
-                raise ValueError(f"{name} must be finite and at least 0, got {weight}")
-        dt = self.plant.dt
-        if not (math.isfinite(self.duration) and self.duration >= dt):
-            raise ValueError(
-                f"duration must be finite and at least one step of {dt} s, "
-                f"got {self.duration}"
-            )
-        if self.preview < 1 or self.preview != int(self.preview):
-            raise ValueError(
-                f"preview must be a whole number of at least 1, got {self.preview}"
-            )
-        if not self.lane > 0:
-            raise ValueError(f"lane must be positive, got {self.lane}")
+        check_intervals(self)
+        if not self.duration >= self.plant.dt:
+            raise ValueError(f"duration must be at least a step, got {self.duration}")
         road = jax.eval_shape(self.family, jax.random.key(0))
         given, wanted = road.initial_state.shape, (len(self.plant.state_names),)
         if given != wanted:
