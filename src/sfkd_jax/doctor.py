@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-import time
 from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from sfkd_jax import store
 from sfkd_jax.experiment import TRAIN
@@ -32,8 +30,6 @@ EXTRAS = {
     ),
 }
 """Extra -> the modules that it installs."""
-NEEDED_MB = 500
-"""Size of the data set, checkpoints and reports of one experiment, at most."""
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -48,8 +44,6 @@ def run(settings: Settings) -> dict[str, Any]:
         f"devices: {', '.join(devices)}; "
         f"{len(affinity(0))} processor cores for this process"
     )
-    seconds = _backend_seconds()
-    print(f"compiles and computes: yes, in {seconds:.1f} s")
     broken = {name: _broken(modules) for name, modules in EXTRAS.items()}
     for name, reason in broken.items():
         advice = f'; pip install "sfkd-jax[{name}]"' if reason else ""
@@ -62,7 +56,6 @@ def run(settings: Settings) -> dict[str, Any]:
         "devices": devices,
         "extras": [name for name, reason in broken.items() if reason is None],
         "advice": advice,
-        "seconds": seconds,
     }
 
 
@@ -79,30 +72,15 @@ def _broken(modules: tuple[str, ...]) -> str | None:
     return None
 
 
-def _backend_seconds() -> float:
-    """Return the seconds that it takes to compile and run a product."""
-    began, where = time.perf_counter(), jax.default_backend()
-    try:
-        total = float(jax.jit(jnp.dot)(jnp.ones(32), jnp.ones(32)))
-    except Exception as failure:
-        raise ValueError(f"jax cannot compute on {where}: {failure}") from failure
-    if total != 32.0:
-        raise ValueError(f"jax computes wrongly on {where}: 32 ones are {total}")
-    return time.perf_counter() - began
-
-
 def _advice(root: Path, devices: list[str]) -> list[str]:
     """Return what would improve the installation, the most important first."""
     directory = root.resolve()
     while not directory.exists():
         directory = directory.parent
-    free = shutil.disk_usage(directory).free // 2**20
     on_cpu = all(device.startswith("cpu") for device in devices)
     advice = []
     if not os.access(directory, os.W_OK):
         advice.append(f"{directory} cannot be written; choose another with root=DIR")
-    if free < NEEDED_MB:
-        advice.append(f"{free} MB are free below {directory}; needed are {NEEDED_MB}")
     if on_cpu and shutil.which("nvidia-smi"):
         advice.append('jax sees no accelerator, but one is there: "jax[cuda12]"')
     return advice

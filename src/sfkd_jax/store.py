@@ -34,8 +34,6 @@ MAX_BYTES = 1 << 24
 """Size of a document; the largest of this package has 0.6 MB. Parsed JSON takes up to
 35 times as much memory.
 """
-MAX_LEVELS = 64
-"""Of a JSON document, so that readers may recurse; those of this package have 7."""
 MAX_LINE = 400
 """Characters of a message, which may quote the file that it is about."""
 LOCK, HOLDER = ".lock", ".lock.holder"
@@ -298,8 +296,7 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 def read_json(path: Path, *, keys: Sequence[str] = ()) -> dict[str, Any]:
     """Return the JSON object in `path`, which has `keys`.
 
-    What two readers could understand differently is refused: a key twice in one object,
-    NaN and infinities, integers beyond 64 bits, half of a surrogate pair.
+    NaN and infinities are refused: they are in no range that a reader could check.
     """
     return _decode(path, read_bytes(path), keys=keys)
 
@@ -309,17 +306,9 @@ def _decode(
 ) -> dict[str, Any]:
     """Return the JSON object in `text`, or raise an ArtefactError about `path`."""
     try:
-        content = text.decode("utf-8-sig")
         document = json.loads(
-            content,
-            parse_float=_finite,
-            parse_constant=_finite,
-            parse_int=_whole,
-            object_pairs_hook=_object,
+            text.decode("utf-8-sig"), parse_float=_finite, parse_constant=_finite
         )
-        if _levels(document) > MAX_LEVELS:
-            raise ValueError(f"more than {MAX_LEVELS} levels")
-        json.dumps(document, ensure_ascii=False).encode()  # no half of a surrogate pair
     except (ValueError, RecursionError) as error:
         raise failure(path, f"{where}truncated or not JSON ({error})") from error
     if not isinstance(document, dict):
@@ -334,27 +323,6 @@ def _finite(text: str) -> float:
     if not math.isfinite(number := float(text)):
         raise ValueError(f"{text} is not finite")
     return number
-
-
-def _whole(text: str) -> int:
-    """Return an integer of 64 bits; other readers would round a longer one."""
-    if not -(2**63) <= (number := int(text)) < 2**64:
-        raise ValueError("an integer does not fit into 64 bits")
-    return number
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object; of a key twice another reader would take the other value."""
-    if len(document := dict(pairs)) < len(pairs):
-        raise ValueError("a key occurs twice in one object")
-    return document
-
-
-def _levels(value: Any) -> int:
-    """Return how deep objects and lists are nested."""
-    inner = value.values() if isinstance(value, dict) else value
-    nested = isinstance(value, dict | list)
-    return 1 + max(map(_levels, inner), default=0) if nested else 0
 
 
 def read_jsonl(path: Path, *, keys: Sequence[str] = ()) -> list[dict[str, Any]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import io
 import re
-import zipfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -17,10 +16,6 @@ from jaxtyping import Float, Int, Shaped
 
 from sfkd_jax.store import open_regular
 
-DECODED = 1 << 29
-"""Largest decoded size of an npz or parquet file [bytes]: few bytes may encode any
-number of equal values.
-"""
 PREAMBLE = 50
 """Lines of a csv file among which its header is looked for."""
 DROP = "; dataset.missing=drop leaves such rows out"
@@ -131,8 +126,8 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
         wanted: names of columns; the header is the line that has most of them.
         blanks: whether empty cells are NaN; otherwise they are text.
     """
-    with _optional("pyarrow", f"{file}: csv files need"):
-        from pyarrow import csv
+    from pyarrow import csv  # quick to load for whoever reads none
+
     # A log may be half as large as the memory: no copy outlives its use.
     lines = _text(file).splitlines()
     filled = [k for k, line in enumerate(lines) if line.strip()]
@@ -258,48 +253,26 @@ def _is_number(value: Any) -> bool:
 
 
 def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
-    """Return the arrays of an npz file, of at most DECODED bytes and no objects."""
-    with _opened(file, "npz") as stream:
-        with zipfile.ZipFile(stream) as packed:
-            _check_decoded(sum(part.file_size for part in packed.infolist()))
-        stream.seek(0)
-        # Pickles would run code.
-        with np.load(stream, allow_pickle=False) as opened:
-            return {name: opened[name] for name in opened.files}
+    """Return the arrays of an npz file, none of them objects."""
+    # Pickles would run code.
+    with _opened(file, "npz") as stream, np.load(stream, allow_pickle=False) as opened:
+        return {name: opened[name] for name in opened.files}
 
 
 def read_parquet(file: Path, wanted: Collection[str]) -> Table:
-    """Read the configured columns of a parquet file, of at most DECODED bytes."""
-    with _optional("pyarrow", f"{file}: parquet files need"):
-        from pyarrow import parquet
+    """Read the configured columns of a parquet file."""
+    from pyarrow import parquet
+
     with _opened(file, "parquet") as stream:
         opened = parquet.ParquetFile(stream)
-        about = opened.metadata
-        groups = [about.row_group(k) for k in range(about.num_row_groups)]
-        cells = [max(about.num_rows, 0) * about.num_columns]
-        # A hostile file may declare fewer rows in one place than in another.
-        cells += [sum(max(one.num_rows, 0) * one.num_columns for one in groups)]
-        columns = [one.column(k) for one in groups for k in range(one.num_columns)]
-        cells += [sum(max(column.num_values, 0) for column in columns)]
-        pages = sum(max(column.total_uncompressed_size, 0) for column in columns)
-        _check_decoded(max(8 * max(cells), pages))
         names = opened.schema_arrow.names
         held = opened.read(among(names, wanted))
-    if not about.num_rows:
+    if not held.num_rows:
         raise ValueError(f"{file}: no rows")
     if len(set(names)) < len(names):
         raise ValueError(f"{file}: two columns have one name")
     arrays = {name: held.column(name).to_numpy() for name in held.column_names}
-    return Table(str(file), arrays, tuple(names), np.arange(about.num_rows))
-
-
-@contextmanager
-def _optional(package: str, need: str) -> Iterator[None]:
-    """Name the extra of a package that is not installed."""
-    try:
-        yield
-    except ImportError:
-        raise ValueError(f'{need} {package}: pip install "sfkd-jax[train]"') from None
+    return Table(str(file), arrays, tuple(names), np.arange(held.num_rows))
 
 
 @contextmanager
@@ -311,14 +284,6 @@ def _opened(file: Path, kind: str) -> Iterator[BinaryIO]:
         except Exception as reason:  # a damaged file raises nearly anything
             first = (str(reason).splitlines() or [type(reason).__name__])[0]
             raise ValueError(f"{file}: not a readable {kind} file ({first})") from None
-
-
-def _check_decoded(size: int) -> None:
-    """Refuse what would fill the memory."""
-    if size > DECODED:
-        raise ValueError(
-            f"{size >> 20} MiB once decoded, at most {DECODED >> 20} are read"
-        )
 
 
 def find_column(
@@ -382,8 +347,8 @@ def find_unit(symbol: str) -> tuple[str, float] | None:
 @cache
 def _registry() -> tuple[Any, dict[str, str]]:
     """Pint's units, and the dimension of every SI unit in base units."""
-    with _optional("pint", "units in column names need"):
-        import pint
+    import pint
+
     units = pint.UnitRegistry()
     bases = {
         dimension: units.parse_units(SPELLINGS.get(symbol, symbol))

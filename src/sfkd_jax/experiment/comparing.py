@@ -175,7 +175,7 @@ def collect_rows(
         row = document["row"] | {"drives": episodes_hash(settings)}
         # Seeds of a row are pooled under one key.
         pooled[cell._replace(seed=0)].append(row)
-        if row.get("provenance", {}).get("source") != runs.source_hash():
+        if row.get("provenance") != runs.provenance():
             by_other_code.append(path)
     notes = {"other settings: left out": others, "other code: used": by_other_code}
     for note, paths in notes.items():

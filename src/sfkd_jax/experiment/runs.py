@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -126,22 +125,10 @@ def write_results(
 
 
 @functools.cache
-def source_hash() -> str:
-    """Return the SHA-256 of the package's Python files, with their paths."""
-    digest = hashlib.sha256()
-    # Sorted, since file systems list files in any order.
-    for file in sorted(PACKAGE.rglob("*.py")):
-        # The zero byte keeps a path and what follows from running together.
-        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0")
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
-
-
-@functools.cache
 def provenance() -> dict[str, str | None]:
-    """Return what made a result: the hash of the source, and its commit.
+    """Return the commit that made a result.
 
-    The commit ends with "+" if files were changed since; outside a checkout it is None.
+    It ends with "+" if files were changed since; outside a checkout it is None.
     """
     commit, command = None, ["git", "-C", str(PACKAGE), "describe", "--always"]
     command += ["--exclude=*", "--abbrev=40", "--dirty=+"]
@@ -150,4 +137,4 @@ def provenance() -> dict[str, str | None]:
         with suppress(OSError, subprocess.CalledProcessError):
             done = subprocess.run(command, capture_output=True, text=True, check=True)
             commit = done.stdout.strip()
-    return {"source": source_hash(), "commit": commit}
+    return {"commit": commit}

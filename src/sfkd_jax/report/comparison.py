@@ -23,7 +23,7 @@ _FIGURE = ("vehicle", *_TABLE)
 
 
 def write_results_page(directory: Path) -> dict[str, Any]:
-    """Write `directory/report/`: index.html, report.md, table1.tex, figures, films.
+    """Write `directory/report/`: index.html, table1.tex, figures, films.
 
     `directory` is that of a comparison, with results.json; the arrays of its rows may
     be missing. Returns the paths of the page and of its images.

@@ -1,4 +1,4 @@
-"""A page of texts, images and tables as HTML and Markdown, and tables as LaTeX."""
+"""A page of texts, images and tables as HTML, and tables as LaTeX."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Section(NamedTuple):
 
 
 def write_page(title: str, sections: list[Section], home: Path) -> dict[str, object]:
-    """Write home/index.html and home/report.md, return where they and images are.
+    """Write home/index.html, return where it and its images are.
 
-    The HTML has its figures inside, and links films, which are larger; the Markdown
-    links both. Links are relative to the page; sections without parts are left out.
+    It has its figures inside, and links films, which are larger; sections without parts
+    are left out.
     """
     sections = [section for section in sections if section.parts]
     filled = _ENVIRONMENT.get_template("page.html").render(
@@ -47,30 +47,24 @@ def write_page(title: str, sections: list[Section], home: Path) -> dict[str, obj
         ],
     )
     write_bytes(home / "index.html", filled.encode())
-    lines = [f"# {_plain(title)}"]
-    for section in sections:
-        lines += [f"## {_plain(section.title)}"] if section.title else []
-        lines += [_as_markdown(part, home) for part in section.parts]
-    write_bytes(home / "report.md", ("\n\n".join(lines) + "\n").encode())
     parts = [part for section in sections for part in section.parts]
     pictures = [str(part.path) for part in parts if isinstance(part, Picture)]
     return {"report": str(home / "index.html"), "figures": pictures}
 
 
 def to_latex(captions: list[tuple[str, pd.DataFrame]]) -> str:
-    """Tables with their captions as floats for booktabs, no wider than the text."""
-    text = "% Needs \\usepackage{booktabs,graphicx}.\n"
-    width = r"\ifdim\width>\linewidth\linewidth\else\width\fi"
+    """Tables with their captions as floats for booktabs."""
+    text = "% Needs \\usepackage{booktabs}.\n"
     for caption, frame in captions:
         words = re.sub(r"([&%$#_{}])", r"\\\1", caption.replace("\\", "/"))
         columns = "l" + "r" * frame.shape[1]
-        rows = frame.to_latex(
-            escape=True, column_format=columns, multicolumn_format="c"
+        text += frame.to_latex(
+            escape=True,
+            caption=words,
+            position="p",
+            column_format=columns,
+            multicolumn_format="c",
         )
-        text += (
-            f"\\begin{{table}}[p]\n\\centering\\footnotesize\n\\caption{{{words}}}\n"
-        )
-        text += f"\\resizebox{{{width}}}{{!}}{{%\n{rows}}}\n\\end{{table}}\n"
     return text
 
 
@@ -96,25 +90,6 @@ def _as_html(part: Part, home: Path) -> str:
 def _is_numeric(frame: pd.DataFrame) -> bool:
     """Whether most cells begin with a digit, a sign or a dash."""
     return bool(frame.map(lambda cell: cell[:1] in "0123456789−–<").mean().mean() > 0.5)
-
-
-def _as_markdown(part: Part, home: Path) -> str:
-    """A part of a page as Markdown."""
-    if isinstance(part, str):
-        return _plain(part)
-    if isinstance(part, Picture):
-        return f"![{_plain(part.alt)}]({part.path.relative_to(home).as_posix()})"
-    heads = [part.columns.names[-1], *part.columns]
-    titles = [head if isinstance(head, str) else " ".join(head) for head in heads]
-    ruler = [":--", *["--:" if _is_numeric(part) else ":--"] * part.shape[1]]
-    lines = [titles, ruler, *([name, *row] for name, *row in part.itertuples())]
-    return "\n".join(f"| {' | '.join(map(_plain, line))} |" for line in lines)
-
-
-def _plain(text: str) -> str:
-    """One line of Markdown without any mark-up from `text`."""
-    line = re.sub(r"([\\`*_\[\]|])", r"\\\1", " ".join(text.split()))
-    return html.escape(line, quote=False)
 
 
 _ENVIRONMENT = Environment(

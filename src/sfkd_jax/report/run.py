@@ -58,7 +58,7 @@ _PATH = _BODY | {
 
 
 def write_report(run_dir: Path) -> dict[str, Any]:
-    """Write `run_dir/report/`: index.html, report.md, figures and a film.
+    """Write `run_dir/report/`: index.html, figures and a film.
 
     Recomputes no number of the run, whose files may be missing but for the policy; the
     same inputs give the same bytes. Returns the paths of the page and of its images.
