@@ -183,12 +183,6 @@ def _checked(name: str, value: Any, hint: Any, *marks: Any) -> Any:
         # Tuples where they are asked for: nobody can change what they are given.
         return origin(_sequence(name, value, parts, marks))
     if origin is dict and isinstance(value, Mapping):
-        for key in value:
-            # A key may become a directory, with spaces replaced.
-            if not _is_below("_".join(str(key).split())):
-                raise ValueError(
-                    f"{name} must have keys that are names of files, got {key!r}"
-                )
         return {
             key: _checked(f"{name}.{key}", inner, parts[1])
             for key, inner in value.items()

@@ -232,7 +232,6 @@ def test_figures_of_states_that_are_not_finite(tmp_path):
     broken[:, 40:] = np.nan
     group[0] = group[0]._replace(lateral=broken)
     style.save(tmp_path / "a.png", figures.first_episode, group)
-    style.save(tmp_path / "b.png", figures.all_episodes, group[0])
 
 
 def film(size, corridor=None, cars=1, **changes):

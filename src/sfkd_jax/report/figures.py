@@ -88,23 +88,6 @@ def _draw_errors(
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.8)
 
 
-def all_episodes(one: Episodes, corridor: float | None = None) -> Figure:
-    """Lateral error of a system in every stored episode."""
-    figure = style.canvas(3.0)
-    axes = figure.subplots()
-    time = one.dt * np.arange(1, one.lateral.shape[1] + 1)
-    axes.plot(time, one.lateral.T, color=style.DARK, linewidth=0.6, zorder=3)
-    if corridor:
-        style.draw_corridor(axes, corridor)
-    finite = np.abs(one.lateral[np.isfinite(one.lateral)])
-    # Away from 0, where the axis would have no height.
-    reach = 1.3 * max(corridor or 0.0, float(np.max(finite, initial=1e-3)))
-    axes.set(xlim=(0.0, time[-1]), ylim=(-reach, reach))
-    axes.set(xlabel="time [s]", ylabel="lateral error [m]")
-    axes.set_title(f"Lateral error of {style.literal(one.name)}, all episodes")
-    return figure
-
-
 def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
     """Position RMSE of prediction without feedback by time ahead.
 

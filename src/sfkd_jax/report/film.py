@@ -221,16 +221,6 @@ def _turn_by(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
 def _nearest(
     positions: Float[np.ndarray, "time 2"], path: Float[np.ndarray, "point column"]
 ) -> np.ndarray:
-    """The closest path point of each position; the search only goes forward.
-
-    So it follows a path that crosses itself.
-    """
-    near = np.zeros(len(positions), dtype=int)
-    for step, position in enumerate(positions):
-        # A few steps back as well, since the closest point may jitter.
-        start = max(int(near[step - 1]) - 5, 0) if step else 0
-        gap = np.sum((path[start : start + 60, :2] - position) ** 2, axis=1)
-        # A car whose state is not finite stays where it was.
-        finite = np.all(np.isfinite(position))
-        near[step] = start + int(np.argmin(gap)) if finite else near[step - 1]
-    return near
+    """The closest path point of each position; of one that is not finite, the first."""
+    gaps = positions[:, None] - path[None, :, :2]
+    return np.argmin(np.nan_to_num(np.sum(gaps**2, axis=-1)), axis=1)

@@ -73,7 +73,7 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         settings = policy.get("config") or {}
         system, experiment = tables.model_of(settings), settings.get("experiment")
         title = f"{style.label(system)}, {plain(experiment or 'unnamed run')}"
-        sections = _sections(run_dir, policy, system, images)
+        sections = _sections(run_dir, policy, images)
         return write_page(
             f"{title}, seed {plain(settings.get('seed'))}", sections, home
         )
@@ -117,9 +117,7 @@ def made_with(config: dict[str, Any], versions: Any) -> Section:
     return Section("Command, settings and versions", parts, folded=True)
 
 
-def _sections(
-    run_dir: Path, policy: dict[str, Any], system: str, images: Path
-) -> list[Section]:
+def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Section]:
     """All sections of the page; a file whose content does not fit is named."""
     results = read_optional(run_dir / "results.json")
     certificate = certificate_document(run_dir, policy)
@@ -131,7 +129,7 @@ def _sections(
         for name, command in MADE_BY.items()
         if not (run_dir / name).exists()
     ]
-    drawn = partial(_driven, run_dir, system, half, images)
+    drawn = partial(_driven, run_dir, half, images)
     sections = [Section("", missing)]
     for title, file, make in (
         ("Closed loop", "results.json", lambda: _scores(results)),
@@ -157,7 +155,7 @@ def _scores(results: dict[str, Any]) -> list[Part]:
 
 
 def _driven(
-    run_dir: Path, system: str, half: Any, images: Path, rows: list[Row] | None
+    run_dir: Path, half: Any, images: Path, rows: list[Row] | None
 ) -> list[Part]:
     """Figures of every group of episodes, and a film of the first one."""
     parts: list[Part] = []
@@ -166,11 +164,6 @@ def _driven(
         title = title_of([group[0].row], SHARED)
         film = number == 1
         parts += draw_episodes(group, images, title, number, corridor, film=film)
-        own = [one for one in group if one.row.get("system") == system]
-        if own and len(own[0].lateral) > 1:
-            path = images / f"all_{number}.png"
-            style.save(path, figures.all_episodes, own[0], corridor)
-            parts.append(Picture(path, f"All episodes: {title}"))
     return parts
 
 
