@@ -25,7 +25,7 @@ from sfkd_jax.data import (
 )
 from sfkd_jax.rollout import fold
 from sfkd_jax.training import fit, multi_step_loss
-from sfkd_jax.types import BODY, Controller
+from sfkd_jax.types import BODY, Controller, Trajectory
 
 LOW, HIGH = (0.6,), (1.4,)  # e: gravity, as a share of the Earth's
 LEVELS, HOLD = (1.0, 0.6, 1.4), 3.0  # e while driving, switched every 3 s
@@ -71,11 +71,31 @@ def under_gain(plant):
 
 def collect(plant, step, gain, runs: int) -> Dataset:
     """Runs under random v, each with its own gravity."""
-    held = plant._replace(step=partial(step, gain))
-    options = {"trajectories": runs, "steps": 75, "excitation": 0.22, "memory": 0.97}
-    options |= {"env_low": LOW, "env_high": HIGH}
-    collected = jax.jit(partial(adapters.collect, held, **options))(jax.random.key(0))
+    steps, excitation, memory = 75, 0.22, 0.97
+    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
     corners = {"env_low": jnp.asarray(LOW), "env_high": jnp.asarray(HIGH)}
+
+    def one(key):
+        start_key, env_key, noise_key = jax.random.split(key, 3)
+        env = jax.random.uniform(env_key, (1,), float, *corners.values())
+        white = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
+
+        def advance(carry, white):
+            state, noise = carry
+            wanted = 0.5 * (low + high) + 0.5 * (high - low) * noise
+            control = jnp.clip(wanted, low, high)
+            after = step(gain, state, control, env)
+            # White noise through a low pass: motors are pushed for longer than a step.
+            noise = memory * noise + jnp.sqrt(1.0 - memory**2) * white
+            return (after, noise), (after, control)
+
+        start = plant.start(start_key)
+        carry, inputs = (start, white[0]), jnp.roll(white, -1, axis=0)
+        _, (states, controls) = jax.lax.scan(advance, carry, inputs)
+        states = jnp.concatenate([start[None], states])
+        return Trajectory(states, controls, jnp.tile(env, (steps, 1)))
+
+    collected = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), runs))
     return split(collected, jax.random.key(1), shares=(0.6, 0.1, 0.2, 0.1), **corners)
 
 

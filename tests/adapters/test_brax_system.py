@@ -2,18 +2,17 @@
 where something is.
 """
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax import envs
-from helpers import at, jit
+from helpers import jit
 
 from sfkd_jax import adapters
-from sfkd_jax import data as datasets
-from sfkd_jax.types import BODY, POSE
+from sfkd_jax.types import BODY
 
 PARAMETERS = ("gravity", "damping", "motor")
 AS_IT_IS = jnp.ones(3)
@@ -40,13 +39,6 @@ def step(body, control, env):
     return stepper()(
         state, jnp.asarray([control], dtype=float), jnp.asarray(env, dtype=float)
     )[BODY]
-
-
-@cache
-def collected():
-    options = {"trajectories": 10, "steps": 12}
-    box = {"env_low": (0.5, 0.5, 0.5), "env_high": (1.5, 1.5, 1.5)}
-    return jit(partial(adapters.collect, plant(), **options, **box))(jax.random.key(0))
 
 
 def test_unmodified_it_moves_as_the_environment_itself():
@@ -78,25 +70,6 @@ def test_a_motor_of_twice_the_force_is_twice_the_control():
     assert np.abs(doubled - step(body, 0.4, (1.0, 1.0, 1.0))).max() > 1e-2
 
 
-def test_collected_trajectories_are_the_plants_and_a_data_set_of_this_project():
-    driven = collected()
-    assert driven.states.shape == (10, 13, 7)
-    assert driven.controls.shape == (10, 12, 1)
-    assert np.all(np.asarray(driven.states)[..., POSE] == 0.0)
-    one = at(driven, 0)
-    for before, after, control, env in zip(
-        one.states, one.states[1:], one.controls, one.envs, strict=False
-    ):
-        np.testing.assert_allclose(after, stepper()(before, control, env), atol=1e-4)
-    assert np.all(np.asarray(driven.envs) == np.asarray(driven.envs)[:, :1])
-    assert np.std(np.asarray(driven.envs)[:, 0], axis=0).min() > 0.05
-    low, high = jnp.full(3, 0.5), jnp.full(3, 1.5)
-    shares = {"shares": (0.4, 0.2, 0.2, 0.2), "env_low": low, "env_high": high}
-    space = datasets.measure_space(datasets.split(driven, jax.random.key(1), **shares))
-    np.testing.assert_array_equal(space.increment_mean, np.zeros(3))
-    np.testing.assert_array_equal(space.increment_scale, np.ones(3))
-
-
 @pytest.mark.parametrize(
     ("environment", "parameters", "message"),
     [
@@ -117,9 +90,3 @@ def test_what_is_no_such_system_is_refused_in_one_line(
     with pytest.raises(ValueError, match=message) as refusal:
         adapters.brax_plant(given, parameters=parameters)
     assert "\n" not in str(refusal.value)
-
-
-def test_a_box_of_another_length_is_refused(key):
-    box = {"env_low": (0.5,), "env_high": (1.0, 1.0, 1.0)}
-    with pytest.raises(ValueError, match="must have an entry for each of gravity, da"):
-        adapters.collect(plant(), key, trajectories=1, steps=2, **box)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax import BraxVehicle as BraxVehicle
     from sfkd_jax.adapters._brax import brax_plant as brax_plant
-    from sfkd_jax.adapters._brax import collect as collect
     from sfkd_jax.adapters._brax import register_brax as register_brax
     from sfkd_jax.adapters._commonroad import (
         commonroad_controller as commonroad_controller,
@@ -29,7 +28,6 @@ _LAZY = {
         "BraxPlant",
         "BraxVehicle",
         "brax_plant",
-        "collect",
         "register_brax",
     ),
     ("_commonroad", "plants"): ("commonroad_controller", "commonroad_vehicle"),

@@ -12,7 +12,6 @@ from brax import envs
 from brax.envs.base import Env, PipelineEnv
 from brax.envs.base import State as BraxState
 from brax.generalized import pipeline
-from jaxtyping import Array, Float
 
 from sfkd_jax.adapters._task import MEASURES, DrivingTask
 from sfkd_jax.types import (
@@ -23,7 +22,6 @@ from sfkd_jax.types import (
     Reference,
     State,
     Step,
-    Trajectory,
 )
 
 NAME = "sfkd_vehicle"
@@ -190,62 +188,3 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
 def _state(moment: Any) -> State:
     """(0, 0, 0, q, q̇) of a state of brax."""
     return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])
-
-
-def collect(
-    plant: BraxPlant,
-    key: Key,
-    *,
-    trajectories: int,
-    steps: int,
-    env_low: tuple[float, ...],
-    env_high: tuple[float, ...],
-    excitation: float = 0.3,
-    memory: float = 0.85,
-) -> Trajectory:
-    """Collect trajectories under random controls, each with its own e from a box.
-
-    u_k = clip(centre + half range · n_k), n_{k+1} = ϱ n_k + √(1 − ϱ²) σ w_k, w white
-    and n_0 = σ w.
-
-    Args:
-        plant: to simulate.
-        key: consumed.
-        trajectories: their number.
-        steps: of a trajectory.
-        env_low: lower corner of the box of e, one entry per parameter.
-        env_high: upper corner of the box.
-        excitation: σ, spread of the controls relative to half their range.
-        memory: ϱ.
-    """
-    if not len(env_low) == len(env_high) == len(plant.parameters):
-        raise ValueError(
-            "env_low and env_high must have an entry for each of "
-            f"{', '.join(plant.parameters)}, got {env_low} and {env_high}"
-        )
-    low, high = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
-
-    def one(key: Key) -> Trajectory:
-        start_key, env_key, noise_key = jax.random.split(key, 3)
-        corners = jnp.asarray(env_low), jnp.asarray(env_high)
-        env = jax.random.uniform(env_key, (len(env_low),), float, *corners)
-        white = excitation * jax.random.normal(noise_key, (steps, low.shape[0]))
-
-        def advance(
-            carry: tuple[State, Array], white: Float[Array, " control"]
-        ) -> tuple[Any, Any]:
-            state, noise = carry
-            wanted = 0.5 * (low + high) + 0.5 * (high - low) * noise
-            control = jnp.clip(wanted, low, high)
-            after = plant.step(state, control, env)
-            # White noise through a low pass: motors are pushed for longer than a step.
-            noise = memory * noise + jnp.sqrt(1.0 - memory**2) * white
-            return (after, noise), (after, control)
-
-        initial = plant.start(start_key)
-        carry, inputs = (initial, white[0]), jnp.roll(white, -1, axis=0)
-        _, (states, controls) = jax.lax.scan(advance, carry, inputs)
-        states = jnp.concatenate([initial[None], states])
-        return Trajectory(states, controls, jnp.tile(env, (steps, 1)))
-
-    return jax.vmap(one)(jax.random.split(key, trajectories))
