@@ -14,14 +14,13 @@ import platform
 import secrets
 import shlex
 import socket
-import stat
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import import_module, metadata
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -30,10 +29,6 @@ from safetensors.numpy import save
 SUFFIX = ".safetensors"
 FORMAT = 2
 """Version of the manifest; a reader refuses every other one."""
-MAX_BYTES = 1 << 24
-"""Size of a document; the largest of this package has 0.6 MB. Parsed JSON takes up to
-35 times as much memory.
-"""
 MAX_LINE = 400
 """Characters of a message, which may quote the file that it is about."""
 LOCK, HOLDER = ".lock", ".lock.holder"
@@ -145,22 +140,10 @@ def plain(value: Any) -> Any:
 # ---- bytes
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file for reading, or raise an ArtefactError."""
-    with as_artefact_error(path, ValueError):  # ValueError: an impossible file name
-        # Opening a pipe would wait for its writer, and a device may have no end.
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise failure(path, "not a regular file")
-        return path.open("rb")
-
-
 def read_bytes(path: Path) -> bytes:
-    """Return the content of `path`, of at most MAX_BYTES, or raise an ArtefactError."""
-    with as_artefact_error(path), open_regular(path) as file:
-        content = file.read(MAX_BYTES + 1)
-    if len(content) > MAX_BYTES:
-        raise failure(path, f"larger than {MAX_BYTES >> 20} MiB")
-    return content
+    """Return the content of `path`, or raise an ArtefactError."""
+    with as_artefact_error(path, ValueError):  # ValueError: an impossible file name
+        return path.read_bytes()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -234,43 +217,28 @@ def read_arrays(
     Another kind or format, other settings than `config`, and arrays or settings that do
     not match their hashes are refused.
     """
-    with _opened(path) as file:
-        manifest = _manifest(path, kind, file)
-        changed = [] if config is None else differences(manifest["config"], config)
-        if changed:
-            more = f" and {len(changed) - 3} more" if changed[3:] else ""
-            listed = "; ".join(changed[:3]) + more
-            raise failure(path, f"made with other settings: {listed}")
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    advice = "the file is truncated, damaged or foreign"
+    with as_artefact_error(path, SafetensorError, ValueError, advice=advice):
+        path.open("rb").close()  # the system's reason why not, before the library's
+        with safe_open(path, framework="numpy") as file:
+            text = (file.metadata() or {}).get("manifest", "")
+            if not text:
+                raise failure(path, "foreign, it has no manifest of sfkd_jax")
+            manifest = _decode(path, text.encode(), where="its manifest is ")
+            _check_manifest(path, kind, manifest)
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     if sha256_of_arrays(arrays) != manifest["sha256"]:
         raise failure(path, "its arrays do not match the sha256 of its manifest")
+    changed = [] if config is None else differences(manifest["config"], config)
+    if changed:
+        more = f" and {len(changed) - 3} more" if changed[3:] else ""
+        listed = "; ".join(changed[:3]) + more
+        raise failure(path, f"made with other settings: {listed}")
     return arrays, manifest
 
 
-def read_manifest(path: Path, *, kind: str) -> dict[str, Any]:
-    """Return the manifest of `path` without reading its arrays; see `read_arrays`."""
-    with _opened(path) as file:
-        return _manifest(path, kind, file)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a safetensors file; what the library raises becomes an ArtefactError."""
-    open_regular(path).close()  # a pipe would block the library
-    advice = "the file is truncated, damaged or foreign"
-    with (
-        as_artefact_error(path, SafetensorError, ValueError, advice=advice),
-        safe_open(path, framework="numpy") as file,
-    ):
-        yield file
-
-
-def _manifest(path: Path, kind: str, file: Any) -> dict[str, Any]:
-    """Return the manifest of an open file, checked without its arrays."""
-    text = (file.metadata() or {}).get("manifest", "")
-    if not 0 < len(text) <= MAX_BYTES:
-        raise failure(path, "foreign, it has no manifest of sfkd_jax")
-    manifest = _decode(path, text.encode(), where="its manifest is ")
+def _check_manifest(path: Path, kind: str, manifest: dict[str, Any]) -> None:
+    """Refuse another kind or format, and settings that do not match their hash."""
     with as_artefact_error(path):
         for name, wanted in (("kind", kind), ("format", FORMAT)):
             if manifest[name] != wanted:
@@ -280,7 +248,6 @@ def _manifest(path: Path, kind: str, file: Any) -> dict[str, Any]:
                 raise failure(path, f"its manifest is malformed, {name}")
         if content_hash(manifest) != manifest["content_sha256"]:
             raise failure(path, "its settings were changed since it was written")
-    return manifest
 
 
 # ---- JSON

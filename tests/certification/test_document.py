@@ -169,7 +169,7 @@ def copied(tmp_path):
 
 
 def test_the_hash_changes_with_every_single_setting():
-    manifest = store.read_manifest(
+    _, manifest = store.read_arrays(
         demo.SHIPPED / "kinematic" / "policy.safetensors", kind=policy.KIND
     )
     settings = dict(leaves(manifest["config"]))

@@ -26,7 +26,6 @@ from sfkd_jax.data._dataset import (
 )
 from sfkd_jax.data._logs import Columns, Delay, Log, find_chords, find_delay, read_logs
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
-from sfkd_jax.store import open_regular
 from sfkd_jax.types import BODY, Trajectory
 
 SUFFIXES = (".csv", ".npz", ".parquet")
@@ -411,7 +410,7 @@ def fingerprint(path: str) -> str:
 def _digest(file: Path, size: int, written: int) -> str:
     """The hash of a file's contents, cached until it is written again."""
     del size, written  # part of the key of the cache
-    with open_regular(file) as stream:
+    with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
 
 

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from sfkd_jax.store import open_regular
+from sfkd_jax.store import as_artefact_error, read_bytes
 
 PREAMBLE = 50
 """Lines of a csv file among which its header is looked for."""
@@ -219,9 +219,7 @@ def among(headers: Iterable[str], wanted: Collection[str]) -> list[str]:
 
 def _text(file: Path) -> str:
     """The text of a file, by its byte order mark, as UTF-8, or else Windows-1252."""
-    with open_regular(file) as stream:
-        content = stream.read()
-    encoding = "utf-8-sig"
+    content, encoding = read_bytes(file), "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
     try:
@@ -278,7 +276,7 @@ def read_parquet(file: Path, wanted: Collection[str]) -> Table:
 @contextmanager
 def _opened(file: Path, kind: str) -> Iterator[BinaryIO]:
     """Open a file; a damaged one is one line, whatever its library raises."""
-    with open_regular(file) as stream:
+    with as_artefact_error(file), file.open("rb") as stream:
         try:
             yield stream
         except Exception as reason:  # a damaged file raises nearly anything

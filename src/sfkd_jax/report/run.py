@@ -69,7 +69,7 @@ def write_report(run_dir: Path) -> dict[str, Any]:
             makes = "python -m sfkd_jax.train makes a run"
             raise store.ArtefactError(f"{weights} is missing: {makes}")
         images = empty_folder(home / "figures")
-        policy = store.read_manifest(weights, kind="policy")
+        _, policy = store.read_arrays(weights, kind="policy")
         settings = policy.get("config") or {}
         system, experiment = tables.model_of(settings), settings.get("experiment")
         title = f"{style.label(system)}, {plain(experiment or 'unnamed run')}"
