@@ -15,7 +15,7 @@ from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.comparison import write_results_page
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
-from sfkd_jax.report.film import LANE, Film, film_of
+from sfkd_jax.report.film import Film, film_of
 from sfkd_jax.report.pages import to_latex
 from sfkd_jax.report.run import write_report
 from sfkd_jax.store import ArtefactError
@@ -253,13 +253,6 @@ def test_a_film_runs_in_real_time_and_is_small(tmp_path):
         ]
     assert all(np.any(a != b) for a, b in itertools.pairwise(frames))
     assert path.stat().st_size < 2e6
-
-
-def test_a_car_leaves_its_lane_at_the_first_value_outside_or_not_finite():
-    lateral = made.arrays(2.0)["lateral"]
-    assert film(2.0).left == [int(np.flatnonzero(np.abs(lateral[0]) > LANE)[0])]
-    assert film(2.0, lateral=np.array([[0.0, np.nan, 0.0]])).left == [1]
-    assert film(2.0, lateral=np.zeros((1, 1))).left == [1]
 
 
 def test_a_film_of_cars_that_leave_or_break(tmp_path):

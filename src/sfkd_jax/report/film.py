@@ -82,10 +82,6 @@ class Film:
         self.cars, self.last, self.corridor = cars, last, corridor
         # Signed, left positive [m].
         self.deviations = [car.lateral[0, :last] for car in cars]
-        # A comparison with NaN is False: a car that is not finite is outside as well.
-        inside = [np.abs(one) <= LANE for one in self.deviations]
-        # First step at which each car is outside of its lane.
-        self.left = [int(np.argmin(np.append(one, False))) for one in inside]
         peaks = [float(np.max(np.abs(one))) for one in self.deviations]
         # A car that leaves its lane would make all others look motionless.
         shown = [corridor or 0.0, *(one for one in peaks if one <= LANE)]
@@ -199,11 +195,9 @@ class Film:
         _put(axes, Line2D(*trail, color=color, linewidth=1.8))
         body = _turn_by(centre[2] - states[now, 2]) @ _CAR + trail[:, -1:]
         _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
-        gone = f", left its lane at {(self.left[number] + 1) * car.dt:.1f} s"
-        words = style.literal(car.name) + gone * (now > self.left[number])
         look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
-        _put(axes, Text(4.5, shift[1, 0] - 2.3, words, **look))
+        _put(axes, Text(4.5, shift[1, 0] - 2.3, style.literal(car.name), **look))
 
 
 def _put(axes: Any, artist: Any) -> None:
