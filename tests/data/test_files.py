@@ -544,14 +544,6 @@ def test_the_same_run_twice_is_found_by_its_numbers(tmp_path, how):
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        (
-            Columns(state=("p_x", "p_y", "yaw")),
-            "dataset.columns.state must name position, position, yaw and speed first",
-        ),
-        (
-            Columns(control=("steering",)),
-            "dataset.columns.control must name two columns, got 1",
-        ),
         (Columns(environment=("friction", "v")), "dataset.columns names v twice"),
         (Columns(environment=()), "pass environment.source=none"),
     ],

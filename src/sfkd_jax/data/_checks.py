@@ -146,28 +146,22 @@ class Checks:
         named = log.channels(self.columns)
         missing = np.isnan(np.column_stack([*named.values()]))
         rows: Bool[np.ndarray, " time"] = np.any(missing, axis=1)
-        share = f"{100 * rows.mean():.2g} % of the rows"
-        found = _first(
+        return _dropped(
             log,
             rows,
             lambda k: f"{[*named][int(missing[k].argmax())]} is nan",
-            hint=f", {share}, dropped by dataset.missing=drop{CUT_THERE}",
-            refused=False,
+            f", {100 * rows.mean():.2g} % of the rows, dropped by dataset.missing=drop",
         )
-        return log.select(~rows), list(found)
 
     def _drop_slow_rows(self, log: Log) -> tuple[Log, list[Finding]]:
         """Drop rows slower than `min_speed` and cut the run there."""
         speed, name = log.states[:, 3], self.columns.state[3]
-        slow, why = np.abs(speed) < self.min_speed, f"={self.min_speed:g}{CUT_THERE}"
-        found = _first(
+        return _dropped(
             log,
-            slow,
+            np.abs(speed) < self.min_speed,
             lambda k: f"{name} is {speed[k]:.3g} m/s",
-            hint=f", dropped by dataset.min_speed{why}",
-            refused=False,
+            f", dropped by dataset.min_speed={self.min_speed:g}",
         )
-        return log.select(~slow), list(found)
 
     def _cut_at_jumps(self, log: Log) -> tuple[Log, list[Finding]]:
         """Cut a run where time goes back and where position or yaw jump.
@@ -455,6 +449,14 @@ def _first(
         k = int(bad.argmax())
         row = k + len(log.time) - len(bad)
         yield Finding(f"{log.at(row)}: {text(k)}{more(bad)}{hint}", refused)
+
+
+def _dropped(
+    log: Log, bad: Bool[np.ndarray, " time"], text: Callable[[int], str], why: str
+) -> tuple[Log, list[Finding]]:
+    """A run without some rows, cut there, and a line about them."""
+    found = _first(log, bad, text, hint=f"{why}{CUT_THERE}", refused=False)
+    return log.select(~bad), list(found)
 
 
 def more(bad: Bool[np.ndarray, " row"]) -> str:
