@@ -288,13 +288,17 @@ def largest_file(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+WEIGHTS = {"x": np.zeros(1)}
+WEIGHTS_SHA256 = store.sha256_of_arrays(WEIGHTS)
+
+
 def write_policy(run, document):
-    """A policy.safetensors without weights whose manifest says what a test wants."""
-    manifest = {"kind": "policy", "format": store.FORMAT, "sha256": "ab" * 32}
+    """A policy.safetensors of one weight whose manifest says what a test wants."""
+    manifest = {"kind": "policy", "format": store.FORMAT, "sha256": WEIGHTS_SHA256}
     manifest |= {"made_from": {}, "versions": {}} | document
     manifest["config"] = document.get("settings") or document.get("config") or {}
     manifest["content_sha256"] = store.content_hash(manifest)
-    content = save({"x": np.zeros(1)}, {"manifest": json.dumps(manifest)})
+    content = save(WEIGHTS, {"manifest": json.dumps(manifest)})
     (run / f"policy{store.SUFFIX}").write_bytes(content)
 
 
