@@ -1,6 +1,7 @@
 """The safety filter: what passes, what it guarantees, and what it reports."""
 
 from functools import cache, partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from helpers import any_law, jit, tiny
 
-from sfkd_jax import build, control
+import sfkd_jax
+from sfkd_jax import build, control, scenarios
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.plants import kinematic
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
 
+SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained"
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
 LOW, HIGH = (-0.4, -5.0), (0.4, 5.0)
@@ -612,3 +615,61 @@ class _Timed(NamedTuple):
     @property
     def tuning(self):
         return _Tuning(self.elapsed)
+
+
+@pytest.mark.parametrize("car", ["dynamic", "kinematic"])
+def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(car):
+    """From 10 m/s at 2.5 m/s², in S3's schedule, with sensor noise and a hard planner."""
+    policy = sfkd_jax.load(SHIPPED / f"{car}_path")
+    plant, law, count = policy.vehicle, policy.law, len(policy.vehicle.state_names)
+
+    def follows(params, memory, xi, env, preview):
+        healthy = {"healthy": jnp.asarray(True)} | about(xi, preview)
+        return law(xi, *preview.road[0], env) + 0.3 * LIMIT, memory, healthy
+
+    planner = Controller(lambda key: (), follows)
+    guard = policy.guard(planner, along_path=True)
+    time = 0.1 * np.arange(200)
+    stop = np.clip(10.0 - 2.5 * (time - 1.5), 0.0, 10.0)
+    speed = np.where(time < 12.5, stop, np.clip(2.0 * (time - 12.5), 0.0, 8.5))
+    # Where the reference is at those times; the window is that of 20 steps later.
+    along = np.cumsum(0.05 * (speed + np.roll(speed, 1)) * (time > 0.0))
+    noise = jnp.asarray([0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001][:count])
+    sample = scenarios.scenario(name="s3", duration=18.5, state_size=count, dt=0.1)
+
+    def run(key):
+        road, sensors = sample(key), jax.random.split(key, 179)
+        at = jax.vmap(scenarios.point_at, in_axes=(None, 0))
+        points = at(road.path, jnp.asarray(along, jnp.float32))
+        points = points.at[:, 3].set(jnp.asarray(speed, jnp.float32))
+
+        def step(carry, k):
+            state, memory = carry
+            window = jax.lax.dynamic_slice_in_dim(points, k + 1, HORIZON)
+            foot = scenarios.project(road.path, state[:2], jnp.asarray(along)[k])
+            seen = state + noise * jax.random.normal(sensors[k], state.shape)
+            action, memory, info = guard.act(
+                policy.params, memory, seen, road.envs[k], window
+            )
+            after = plant.step(state, action, road.envs[k])
+            told = info["corridor"], info["rolling"], info["shield_healthy"]
+            return (after, memory), (*foot, state[3], *told)
+
+        start = road.initial_state, guard.init(key)
+        return jax.lax.scan(step, start, jnp.arange(179))[1]
+
+    seeds = jax.random.split(jax.random.key(5), 4)
+    foot, left, moving, corridor, rolling, holds = map(
+        np.asarray, jit(jax.vmap(run))(seeds)
+    )
+    # Standing from 7.5 s on: 5 s, while the sensors say that it moves either way.
+    assert moving[:, 75:125].max() < 0.02
+    assert np.all(np.abs(foot[:, 125] - foot[:, 75]) < 0.01)
+    assert moving[:, -1].min() > 7.6
+    assert holds.all()
+    assert np.all(np.abs(left) <= corridor)
+    # The bound grows while it rolls, not while it stands, and is forgotten afterwards.
+    grown = rolling[:, 125]
+    assert np.all((grown > 0.0) & (grown < 0.2))
+    assert np.all(grown - rolling[:, 75] < 0.005)
+    assert np.all(rolling[:, -1] == 0.0)

@@ -350,7 +350,24 @@ def in_corridor(
         decay=certificate["alpha"],
         control=(plant.control_low, plant.control_high),
         conditions=_conditions(law, certificate),
+        dt=plant.dt,
+        rear=_rear(law),
     ).controller()
+
+
+def _rear(law: control.PathLaw) -> float:
+    """The slip of a turn that the tyres hardly feel, per curvature [m].
+
+    At one lateral acceleration ψ* differs between two speeds by this times κ alone.
+    """
+    last = law.state.shape[0] - 1
+    # The gentlest turn of the table that is one.
+    row = min(last // 2 + 1, last)
+    gentle = np.asarray(law.state)[row, ..., HEADING]
+    sideways = float(law.high[0]) * (2.0 * row / last - 1.0)
+    slow, fast = float(law.low[1]), float(law.high[1])
+    bends = sideways / slow**2 - sideways / fast**2
+    return max(float(np.median(gentle[-1] - gentle[0])) / bends, 0.0)
 
 
 def _test(certificate: Mapping[str, Any] | None) -> control.InnovationTest | None:

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.laws._recovery import PathErrors, holding
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._gate import ANYWHERE, Box, Conditions
-from sfkd_jax.geometry import LATERAL, PathState, path_state
+from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.ranges import (
     AtLeastOne,
     Fraction,
@@ -145,6 +146,7 @@ class ShieldState(NamedTuple):
             vehicle since; otherwise it starts anew at the next measurement.
         env: that of the last step, clipped to its box; NaN before the first one.
         offset: what the start adds to the bound of |e_y − ê_y| [m].
+        rolling: bound of |e_y| at the next step whatever steers [m]; NaN without one.
     """
 
     inner: Any
@@ -152,6 +154,7 @@ class ShieldState(NamedTuple):
     started: Bool[Array, ""]
     env: Environment
     offset: Scalar
+    rolling: Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,6 +180,15 @@ class Shield:
     - After any of these, and after steps that the gate did not measure or trust, the
       nominal model starts anew at the next measurement, with `offset` = start_error for
       the noise in it.
+    - Slower than the conditions, down to rest and up again: the law drives alone, as
+      outside of them, but the corridor goes on from its last value, if it had one:
+
+          corridor⁺ = corridor + v dt |sin χ|,   χ = e_ψ − ψ*(κ, v, e)
+
+      Time does not contract at rest, and this holds for every controller: proved is
+      |e_y(t)| ≤ |e_y(0)| + ∫ |sin χ| ds for the course χ of the car relative to the
+      path. That the heading of the steady turn, ψ*, tells its slip is measured, and
+      so is χ once a step. `rolling` is how much of `corridor` came in this way [m].
     - Before the first measurement there is no nominal model. The control of the wrapped
       controller passes, clipped, or 0 if it is not finite.
 
@@ -201,6 +213,9 @@ class Shield:
         start_error: `offset` of a nominal model that starts at a measurement [m].
         decay: of `offset` per step, the certified rate.
         conditions: where the certificate applies.
+        dt: sampling period [s].
+        rear: distance from the rear axle to the position of the vehicle [m], of which
+            the slip is l κ at walking pace.
 
     Raises:
         ValueError: the model is not in path coordinates, or a setting is out of range.
@@ -219,6 +234,8 @@ class Shield:
     start_error: NonNegative = 0.0
     decay: Fraction = 0.9
     conditions: Conditions = ANYWHERE
+    dt: Positive = 0.1
+    rear: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         if not self.model.along_path:
@@ -258,6 +275,7 @@ class Shield:
             started=jnp.asarray(False),
             env=jnp.full(environments, jnp.nan, dtype=float),
             offset=jnp.zeros(()),
+            rolling=jnp.full((), jnp.nan, dtype=float),
         )
 
     def act(
@@ -294,7 +312,15 @@ class Shield:
         # Whoever brakes knows of something that no certificate does.
         gentlest = jnp.clip(law_control, low, high) - self.law.perturbation
         braking = usable & now.started & (planned[1] < gentlest[1] - 1e-3)
-        control = control.at[1].set(jnp.where(braking, planned[1], control[1]))
+        drive = jnp.where(braking, planned[1], control[1])
+        # Where the reference stands a law drives by the noise of a speed: it creeps.
+        speed, (left, turned) = road[0, 1], coordinates[:PATH_SPEED]
+        errors = PathErrors(left, turned, coordinates[PATH_SPEED] - speed)
+        still = drive - holding(errors, speed)
+        stands = now.started & (speed == 0.0)
+        control = control.at[1].set(
+            jnp.where(stands, jnp.clip(still, low[1], 0.0), drive)
+        )
 
         cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
         feasible = now.started & chosen.feasible
@@ -304,6 +330,10 @@ class Shield:
         holds = applies & feasible
         intervention = jnp.where(now.started & jnp.any(chosen.nu != request), cut, 0.0)
         corridor = self.width + self.tube + now.offset
+        usual = jnp.where(holds, corridor, jnp.nan)
+        known = preview.trusted & jnp.all(preview.measured)
+        rolls = self._slow(coordinates, road[0]) & known & ~holds
+        corridor = jnp.where(rolls, state.rolling, usual)
         report: Any = {
             **info,
             **flags,
@@ -312,17 +342,44 @@ class Shield:
             "perturbation": chosen.nu,
             "braking": braking,
             "feasible": feasible,
-            "corridor": jnp.where(holds, corridor, jnp.nan),
-            "shield_healthy": holds,
+            "corridor": corridor,
+            "rolling": jnp.where(rolls, corridor - self.width - self.tube, 0.0),
+            "shield_healthy": jnp.isfinite(corridor),
             "healthy": usable & holds & (intervention == 0.0),
         }
         # A latent that is not finite would stay so: the nominal model starts anew.
         running = applies & all_finite(chosen.latent)
         latent = jax.tree.map(partial(jnp.where, running), chosen.latent, now.latent)
+        aside = self._aside(coordinates, road[0], now.env)
         after = now._replace(
-            latent=latent, started=running, offset=self.decay * now.offset
+            latent=latent,
+            started=running,
+            offset=self.decay * now.offset,
+            rolling=corridor + aside,
         )
         return control, after, report
+
+    def _slow(self, xi: PathState, road: Float[Array, " 2"]) -> Bool[Array, ""]:
+        """Whether the car or its reference is slower than the conditions."""
+        state, given = self.conditions.state, self.conditions.road
+        slow = (
+            jnp.asarray(False)
+            if state is None
+            else xi[PATH_SPEED] < state[0][PATH_SPEED]
+        )
+        return slow if given is None else slow | (road[1] < given[0][1])
+
+    def _aside(
+        self, xi: PathState, road: Float[Array, " 2"], env: Environment
+    ) -> Scalar:
+        """How far a step moves the car across the path: v dt |sin χ| [m]."""
+        slowest = self.law.low[1]
+        steady = self.law.turn(road[0], road[1], env).state[HEADING]
+        # The table ends at its lowest speed; below, the tyres slip less, and the car
+        # turns about its rear axle.
+        slower = 1.0 - jnp.minimum(road[1] / slowest, 1.0) ** 2
+        course = xi[HEADING] - steady + self.rear * road[0] * slower
+        return self.dt * jnp.abs(xi[PATH_SPEED] * jnp.sin(course))
 
     def _road(self, preview: Preview) -> Float[Array, "preview 2"]:
         """κ and v_ref over the horizon of the filter."""
@@ -378,7 +435,7 @@ class Shield:
             "env_inside": jnp.all(inside == env),
         }
         offset = jnp.where(moved, self.start_error, before.offset)
-        now = ShieldState(before.inner, latent, started, inside, offset)
+        now = before._replace(latent=latent, started=started, env=inside, offset=offset)
         return now, fiber, law_control, flags
 
 
