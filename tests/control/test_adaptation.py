@@ -223,7 +223,7 @@ def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
     state, act = acting()
     gate, scores = state.inner, jnp.asarray([2.0, 1.0])
-    belief = gate.inner.belief._replace(scores=scores, started=jnp.asarray(True))
+    belief = gate.inner.belief._replace(scores=scores)
     gate = gate._replace(inner=gate.inner._replace(belief=belief))
     state = state._replace(inner=gate)
     _, _, info = act({}, state, *INPUTS)

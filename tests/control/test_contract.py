@@ -123,15 +123,14 @@ def shielded():
         control=(LIMITS["control_low"], LIMITS["control_high"]),
         conditions=control.Conditions(env=(BOX["env_low"], BOX["env_high"])),
     )
-    gate = control.Gate(
-        inner=shield.controller(),
-        model=model,
-        law=law,
-        dt=PLANT.dt,
-        horizon=HORIZON,
-        conditions=shield.conditions,
-    )
-    return along(gate.controller()), params
+    return gated(shield.controller(), model, law, shield.conditions), params
+
+
+def gated(inner, model, law, conditions):
+    """A controller along a path behind the gate, in the world."""
+    about = {"model": model, "law": law, "dt": PLANT.dt, "horizon": HORIZON}
+    gate = control.Gate(inner=inner, conditions=conditions, **about)
+    return along(gate.controller())
 
 
 def adaptive():
@@ -141,7 +140,8 @@ def adaptive():
     adaptation = control.Adaptation(
         inner=planner, model=model, law=law, **LIMITS, **BOX
     )
-    return along(adaptation.controller()), params
+    conditions = control.Conditions(env=(BOX["env_low"], BOX["env_high"]))
+    return gated(adaptation.controller(), model, law, conditions), params
 
 
 def online_tube():

@@ -380,8 +380,7 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
     xi, reference = vehicle_state(jnp.asarray([0.1, 0.0, SPEED])), circle()
     # What is planned, and what passes of it.
     cases = [([0.1, 0.7],) * 2, ([9.0, 0.7], [0.4, 0.7]), ([np.nan, 1.0], [0.0, 0.5])]
-    unknown = [(xi * jnp.nan, ENV, reference), (xi, ENV * jnp.nan, reference)]
-    for seen in (*unknown, (xi, ENV, reference * jnp.nan)):
+    for seen in ((xi * jnp.nan, ENV, reference), (xi, ENV, reference * jnp.nan)):
         for planned, passed in cases:
             action, after, info = act(jnp.asarray(planned), start, *seen)
             np.testing.assert_allclose(action, passed)
@@ -448,8 +447,10 @@ BOX = Conditions(state=((-0.3, -0.1, 8.0), (0.3, 0.1, 10.0)))
 """Where the toy's model predicts; a step may be off by a share of half its widths."""
 
 
-def told(tamper, steps=120, disturbances=None, clock=None, **changes):
-    """True xi and info where the vehicle's state is told wrong: (observation, k) -> it."""
+def told(tamper, steps=120, disturbances=None, lag=lambda k: 0, **changes):
+    """True xi and info where the vehicle's state is told wrong: (observation, k) -> it,
+    or late: k -> steps.
+    """
     inner = control.Shield(
         inner=scripted(),
         model=TOY,
@@ -466,14 +467,18 @@ def told(tamper, steps=120, disturbances=None, clock=None, **changes):
     pushed = jnp.asarray(random * DISTURBANCE if disturbances is None else disturbances)
 
     def step(carry, inputs):
-        (xi, memory), (k, push) = carry, inputs
-        seen = tamper(vehicle_state(xi), k)
+        (xi, past, memory), (k, push) = carry, inputs
+        past = jnp.concatenate([xi[None], past[:-1]])
+        # The reference goes on with the vehicle: what is late lies behind.
+        late = vehicle_state(past[lag(k)]).at[0].add(-0.1 * SPEED * lag(k))
+        seen = tamper(late, k)
         action, memory, info = controller.act(script, memory, seen, ENV, circle())
         nu = action - LAW(xi, *road, ENV)
         after = A @ xi + B @ nu + jnp.asarray([0.0, 2e-4 * ENV[1], 0.1 * SPEED])
-        return (after + push, memory), (xi, info)
+        return (after + push, past, memory), (xi, info)
 
-    carry = jnp.asarray([0.0, 0.0, SPEED]), controller.init(jax.random.key(0))
+    start = jnp.asarray([0.0, 0.0, SPEED])
+    carry = start, jnp.tile(start, (12, 1)), controller.init(jax.random.key(0))
     return jit(lambda: jax.lax.scan(step, carry, (jnp.arange(steps), pushed))[1])()
 
 
@@ -507,6 +512,19 @@ def test_what_one_step_cannot_explain_is_not_followed(name):
     if name == "jump":
         # The heading is still measured, the position is not.
         assert np.asarray(info["measured"])[lost].tolist() == [[False, True, True]] * 18
+
+
+def test_a_delay_is_recognised_and_made_up_for_far_beyond_the_patience():
+    """Under a push that would drive a car without measurements off its path."""
+    push = np.tile(0.5 * DISTURBANCE * [0.0, 1.0, 0.0], (160, 1))
+    late = partial(told, lambda o, k: o, 160, push)
+    for lag in (3, 10):
+        xi, info = late(lambda k, lag=lag: jnp.where(between(k, 40, 90), lag, 0))
+        assert np.all(info["dead_reckoning"] == between(np.arange(160), 40, 90))
+        assert not np.any(info["healthy"][40:90])
+        assert np.max(np.abs(xi[:, 0])) < 0.1
+    blind = lambda o, k: jnp.where(between(k, 40, 90), jnp.nan, o)
+    assert np.max(np.abs(told(blind, 160, push, patience=9.0)[0][:, 0])) > 0.2
 
 
 def test_after_its_patience_a_measurement_is_believed_and_nothing_claimed_for_a_while():

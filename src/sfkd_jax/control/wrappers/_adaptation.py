@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._estimator import (
     CAUSES,
@@ -182,15 +181,13 @@ class Adaptation:
         force = 1.0 if self.estimate_env else 0.1
         prior = jnp.asarray([*noise, force, *self.slow_prior], dtype=float) ** 2
         count = self._estimator.frictions.shape[0]
-        unknown = jnp.full(2, jnp.nan, dtype=float)
         belief = Belief(
             bank=Bank(
                 jnp.zeros((count, len(noise) + CAUSES)),
                 jnp.tile(jnp.diag(prior), (count, 1, 1)),
                 jnp.full(count, 1.0 / count, dtype=float),
             ),
-            applied=Applied(jnp.zeros(2), unknown, jnp.array(unknown)),
-            started=jnp.asarray(False),
+            applied=Applied(jnp.zeros(2), jnp.zeros(2), self._inside(jnp.zeros(2))),
             scores=jnp.zeros(2),
         )
         return AdaptiveState(self.inner.init(key), belief)
@@ -207,12 +204,9 @@ class Adaptation:
         estimator, before = self._estimator, state.belief
         loop, size = estimator.loop, coordinates.shape[0]
         params = fold(self.model, params)
-        clean = all_finite((coordinates, preview.road))
-        clean &= self.estimate_env | all_finite(env)
-        env, road = self._known_environment(before, env), preview.road[0]
+        env, road = self._inside(env), preview.road[0]
         # Nothing is learned from what the gate did not believe, nor at another rate.
         usable = jnp.all(preview.measured) & preview.on_time
-        usable &= all_finite((coordinates, env, preview.road))
         belief, rejected = estimator.follow(params, before, coordinates, usable)
         adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
         # Causes that predict worse than none are not used, unless e depends on them.
@@ -229,27 +223,20 @@ class Adaptation:
         control, inner, info = self.inner.act(
             offset, state.inner, coordinates, inside, preview
         )
-        correction = offset.inputs[:2] - input_error(causes, road)
-        control = control + jnp.where(jnp.isfinite(correction), correction, 0.0)
+        control = control + offset.inputs[:2] - input_error(causes, road)
         limits = jnp.asarray(self.control_low), jnp.asarray(self.control_high)
         control = jnp.clip(control, *limits)
 
         report: ControllerInfo = {
             **info,
-            "healthy": info["healthy"] & clean,
             "env_estimate": inside,
             "causes": causes,
             "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
             "rejected": rejected,
             "adapting": adapting,
         }
-        # What is not finite acts as before, as far as is known.
-        applied = jax.tree.map(
-            lambda now, last: jnp.where(jnp.isfinite(now), now, last),
-            Applied(control, road, env),
-            belief.applied,
-        )
-        return control, AdaptiveState(inner, belief._replace(applied=applied)), report
+        belief = belief._replace(applied=Applied(control, road, env))
+        return control, AdaptiveState(inner, belief), report
 
     @cached_property
     def _estimator(self) -> Estimator:
@@ -277,13 +264,10 @@ class Adaptation:
                 noise=jnp.tile(jax.vmap(jnp.diag)(drifts), (frictions.shape[0], 1, 1)),
             )
 
-    def _known_environment(self, belief: Belief, env: Environment) -> Environment:
-        """e in its box; if it is not finite, the last one; any if it is estimated."""
+    def _inside(self, env: Environment) -> Environment:
+        """e in its box; the middle of it if e is estimated."""
         low, high = jnp.asarray(self.env_low), jnp.asarray(self.env_high)
-        if self.estimate_env:
-            return 0.5 * (low + high)
-        known = jnp.where(all_finite(env), env, belief.applied.env)
-        return jnp.clip(known, low, high)
+        return 0.5 * (low + high) if self.estimate_env else jnp.clip(env, low, high)
 
 
 def _compensation(
@@ -326,5 +310,4 @@ def _compensation(
     _, latent = jax.jvp(
         lambda state: model.encode(fiber, state), (path_state(coordinates),), (moved,)
     )
-    latent = jax.tree.map(lambda leaf: jnp.where(jnp.isfinite(leaf), leaf, 0.0), latent)
     return Offset(params, jnp.zeros(4).at[0].set(steering), latent)

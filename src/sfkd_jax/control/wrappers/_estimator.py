@@ -276,14 +276,12 @@ class Belief(NamedTuple):
     Attributes:
         bank: of (ξ, causes).
         applied: what acted on the vehicle since the last step.
-        started: whether ξ was ever measured.
         scores: squared normalised errors of one-step predictions, with the causes and
             without, averaged over the last seconds.
     """
 
     bank: Bank
     applied: Applied
-    started: Bool[Array, ""]
     scores: Float[Array, " 2"]
 
 
@@ -327,27 +325,19 @@ class Estimator:
         """
         size = measured.shape[0]
         expected = self._advanced(params, belief)
-        measured = jnp.where(usable, measured, 0.0)
+        # Without measurements a model may diverge in time.
+        expected = _select(all_finite(expected), expected, belief.bank)
         after, explained = corrected(expected, measured, self.sensors)
         bounds = jnp.asarray(BOUNDS)
         causes = jnp.clip(after.means[:, size:], -bounds, bounds)
         after = after._replace(means=after.means.at[:, size:].set(causes))
-        learned = belief.started & usable & explained & all_finite(after)
-        # A prediction that is not finite, or of nothing, is not followed: the filters
-        # stay where they were until a measurement moves them.
-        follows = belief.started & all_finite(expected)
-        bank = _select(follows, expected, belief.bank)
-        bank = _select(learned, after, bank)
+        learned = usable & explained
+        bank = _select(learned, after, expected)
         # Not explained, but usable: the car is believed to be there, without a cause.
         bank = _select(usable & ~learned, self._restarted(bank, measured), bank)
-        expected = _select(all_finite(expected), expected, belief.bank)
         scores = self._scores(params, belief, expected, measured)
-        belief = belief._replace(
-            bank=bank,
-            started=belief.started | usable,
-            scores=jnp.where(learned & all_finite(scores), scores, belief.scores),
-        )
-        return belief, ~learned
+        scores = jnp.where(learned, scores, belief.scores)
+        return belief._replace(bank=bank, scores=scores), ~learned
 
     def causes(self, belief: Belief, shrinkage: float) -> Float[Array, " cause"]:
         """Return the estimated causes, with f̂ max(0, 1 − s var f / f̂²) of the force.

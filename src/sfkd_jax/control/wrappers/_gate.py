@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -49,7 +50,9 @@ Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 MOVING = 0.3
 """Speed [m/s] above which a repeated observation is that of a sensor that froze."""
 PATIENCE_AHEAD = 6.0
-"""Longest time without an observation from another place of the path [s]."""
+"""Longest time on observations from another place of the path, or without them [s]."""
+LATEST = 1.2
+"""Largest delay of an observation that is recognised [s]."""
 SLOWING = 0.8
 """Speed [m/s] by which a lost vehicle's reference is below its speed: braking."""
 
@@ -100,8 +103,9 @@ class GateState(NamedTuple):
             measurement was believed that nothing explains.
         env: the last finite environment.
         road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
-            NaN before the first one.
+            0 before the first one.
         test: of the innovations, or None.
+        past: estimates of ξ at the last steps, newest first, and κ there [1/m].
     """
 
     inner: Any
@@ -114,30 +118,7 @@ class GateState(NamedTuple):
     env: Environment
     road: Float[Array, "preview 2"]
     test: InnovationState | None
-
-
-class Believed(NamedTuple):
-    """What the gate makes of one measurement.
-
-    Attributes:
-        xi: ξ, measured where it is believed.
-        measured: where it is.
-        compared: whether there was a prediction.
-        innovation: ξ − ξ⁻.
-        plausible: where the step explains it.
-        forced: whether something is believed that the step does not explain.
-        lost: whether there has been nothing to believe for too long.
-        skew: see `GateState`.
-    """
-
-    xi: PathState
-    measured: Bool[Array, " coordinate"]
-    compared: Bool[Array, ""]
-    innovation: PathState
-    plausible: Bool[Array, " coordinate"]
-    forced: Bool[Array, ""]
-    lost: Bool[Array, ""]
-    skew: Scalar
+    past: Float[Array, "step coordinate+1"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,11 +131,12 @@ class Gate:
     A coordinate that does not pass, is not finite, or belongs to an observation that
     repeats the last one bit for bit while the vehicle moves, is replaced by ξ⁻: the
     vehicle drives on its nominal model, with the other coordinates measured; of the yaw
-    of a wrong pose the changes are. After
-    `patience` a finite measurement is believed, whatever it says, and the certificate
-    is not claimed for a `trial`; without one the reference speed falls, and the vehicle
-    stops. Outside the conditions ξ⁻ is a point that keeps its heading and speed, and
-    the limits are what a vehicle can reach.
+    of a wrong pose the changes are. An observation that lies behind on the path, where
+    the vehicle was up to 1.2 s ago, is late, and corrects the estimates since then.
+    After `patience` a finite measurement is believed, whatever it says, and the
+    certificate is not claimed for a `trial`; without one, or 6 s of late ones, the
+    reference speed falls, and the vehicle stops. Outside the conditions ξ⁻ is a point
+    that keeps its heading and speed, and the limits are what a vehicle can reach.
 
     An environment or reference that is not finite is replaced by the last one, and by
     the middle of the box of e before the first; the road moves on with every step.
@@ -205,9 +187,8 @@ class Gate:
 
     def init(self, key: Key) -> GateState:
         """Return the state before the first control step."""
-        size, box = self.law.gain.shape[-1], self.conditions.env
-        unknown = jnp.full(self.law.low.shape[0] - 2, jnp.nan, dtype=float)
-        middle = unknown if box is None else 0.5 * jnp.sum(jnp.asarray(box), axis=0)
+        size = self.law.gain.shape[-1]
+        box = self.conditions.env or (self.law.low[2:], self.law.high[2:])
         return GateState(
             inner=self.inner.init(key),
             expected=jnp.full(size, jnp.nan, dtype=float),
@@ -216,9 +197,10 @@ class Gate:
             missing=jnp.zeros(size, jnp.int32),
             skew=jnp.zeros(()),
             doubt=jnp.zeros((), jnp.int32),
-            env=middle,
-            road=jnp.full((self.horizon, 2), jnp.nan, dtype=float),
+            env=0.5 * jnp.sum(jnp.asarray(box, dtype=float), axis=0),
+            road=jnp.zeros((self.horizon, 2)),
             test=self.test and self.test.init(),
+            past=jnp.full((round(LATEST / self.dt), size + 1), jnp.nan, dtype=float),
         )
 
     def act(
@@ -234,53 +216,49 @@ class Gate:
         readable = all_finite(preview.road)
         moved_on = jnp.concatenate([state.road[1:], state.road[-1:]])
         road = jnp.where(readable, preview.road, moved_on)
+        # Without the road a position is beside nothing.
+        coordinates = jnp.where(readable, coordinates, jnp.nan)
         env_known = all_finite(env) | (not self.reads_env)
-        known = jnp.where(all_finite(env), env, state.env)
+        env = jnp.where(all_finite(env), env, state.env)
         periods = _elapsed(state.inner)
         on_time = jnp.abs(periods - 1.0) < 1e-3
+        preview = preview._replace(road=road, on_time=on_time)
 
-        found = self._believed(state, coordinates, preview, periods)
-        xi, measured, compared = found.xi, found.measured, found.compared
-        doubt = jnp.where(found.forced, round(self.trial / self.dt), state.doubt)
-        clean = jnp.all(measured)
+        xi, measured, lost, after = self._believed(state, coordinates, preview, periods)
+        clean, compared = jnp.all(measured), all_finite(state.expected)
         tested, verdict = self._tested(state, coordinates, measured & clean & on_time)
         clear = on_time & readable & env_known
-        trusted = preview.trusted & clear & (doubt == 0) & ~verdict["innovation_alarm"]
+        trusted = preview.trusted & clear & (after.doubt == 0)
+        trusted &= ~verdict["innovation_alarm"]
         # Nothing to believe and nothing to rely on: stop.
         slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
-        road = jnp.where(found.lost, road.at[:, 1].set(slower), road)
+        road = jnp.where(lost, road.at[:, 1].set(slower), road)
 
-        seen = preview._replace(
-            road=road, measured=measured, on_time=on_time, trusted=trusted
-        )
-        control, inner, info = self.inner.act(params, state.inner, xi, known, seen)
+        seen = preview._replace(road=road, measured=measured, trusted=trusted)
+        control, inner, info = self.inner.act(params, state.inner, xi, env, seen)
 
-        # A believed outlier starts anew; noise is averaged.
-        estimate = state.expected + self.gain * _difference(xi, state.expected)
-        estimate = jnp.where(compared & (found.plausible | ~measured), estimate, xi)
-        applied = Applied(control, road[0], info.get("env_estimate", known))
-        ahead, modelled = self._predict(params, estimate, applied)
+        estimate = after.past[0, :-1]
+        applied = Applied(control, road[0], info.get("env_estimate", env))
+        expected, modelled, _ = self._predict(params, estimate, applied)
         tested = self._expect(tested, params, xi, applied, info, clear & clean)
+        innovation = _difference(coordinates, state.expected)
         report: Any = {
             **info,
             "healthy": info.get("healthy", True) & clean & trusted,
             "measured": measured,
             "dead_reckoning": compared & ~clean,
-            "innovation": jnp.where(measured, found.innovation, jnp.nan),
+            "innovation": jnp.where(measured, innovation, jnp.nan),
             "path_state": jnp.where(measured, coordinates, jnp.nan),
             **verdict,
             "trusted": trusted,
             "env_inside": info.get("env_inside", True) & env_known,
         }
-        after = GateState(
+        after = after._replace(
             inner=inner,
-            expected=ahead,
+            expected=expected,
             modelled=modelled,
-            along=jnp.where(clean, preview.along, state.along),
-            missing=jnp.where(measured, 0, state.missing + 1),
-            skew=found.skew,
-            doubt=jnp.maximum(doubt - 1, 0),
-            env=known,
+            doubt=jnp.maximum(after.doubt - 1, 0),
+            env=env,
             road=road,
             test=tested,
         )
@@ -292,46 +270,98 @@ class Gate:
         coordinates: PathState,
         preview: Preview,
         periods: Scalar,
-    ) -> Believed:
-        """What of a measurement is used, and what stands for the rest."""
-        readable = all_finite(preview.road)
+    ) -> tuple[PathState, Bool[Array, " coordinate"], Bool[Array, ""], GateState]:
+        """What a measurement says: it is right, late, or wrong in position or yaw.
+
+        Returns:
+            ξ, measured where that is believed; where it is; whether there has been
+            nothing to believe for too long; the state with what follows from that.
+        """
         expected, compared = state.expected, all_finite(state.expected)
         innovation = _difference(coordinates, expected)
-        limit = self._limit(state, expected, periods)
-        # The path goes on under the vehicle: an observation that is suddenly ahead or
-        # behind is late, or of another place, in all of its entries.
-        shifted = jnp.abs(preview.along - state.along) > self._reach(state, periods)
-        # Not for ever: the reference may have moved, and the car has stopped by then.
-        shifted &= jnp.max(state.missing) < round(PATIENCE_AHEAD / self.dt)
-        moving = jnp.abs(expected[PATH_SPEED]) > MOVING
-        stale = (preview.repeated | shifted) & moving
-        usable = jnp.isfinite(coordinates) & readable & ~stale
+        limit = self._limit(state, periods, preview.on_time)
         grown = limit * (1.0 + self.growth * state.missing)
         plausible = jnp.abs(innovation) <= grown
+        moving = jnp.abs(expected[PATH_SPEED]) > MOVING
+        seen = jnp.isfinite(coordinates) & ~(preview.repeated & moving)
+
+        # The path goes on under the vehicle: an observation that is suddenly ahead or
+        # behind is of another time or place, in all of its entries.
+        gap = preview.along - state.along
+        shifted = (jnp.abs(gap) > self._reach(state, periods)) & moving
+        earlier, off, past = self._earlier(state, coordinates, preview.road[0, 0], gap)
+        late = jnp.all(seen & (jnp.abs(earlier) <= grown)) & preview.on_time & shifted
+        # Not for ever: the reference may have moved, and the car has stopped by then.
+        longest = round(PATIENCE_AHEAD / self.dt)
+        usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
+
         # What stays implausible for so long is true: the prediction was wrong.
-        late = state.missing >= round(self.patience / self.dt)
+        longest = jnp.where(late, longest, round(self.patience / self.dt))
+        overdue = state.missing >= longest
         # But a yaw alone: the position would show it.
-        late = late.at[HEADING].set(late[HEADING] & ~plausible[LATERAL])
-        measured = usable & (plausible | late | ~compared)
+        overdue = overdue.at[HEADING].set(overdue[HEADING] & ~plausible[LATERAL])
+        measured = usable & (plausible | overdue | ~compared)
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         missing = jnp.where(measured, 0, state.missing + 1)
         xi = jnp.where(measured, coordinates, expected)
-        pose_wrong = compared & ~(measured[LATERAL] & measured[HEADING])
-        skewed = pose_wrong & usable[HEADING]
-        heading, skew = _heading(state, coordinates, innovation, grown[HEADING])
-        xi = xi.at[HEADING].set(jnp.where(skewed, heading, xi[HEADING]))
-        lost = (missing > round(self.patience / self.dt)) & ~usable
-        return Believed(
-            xi=xi,
-            measured=measured,
-            compared=compared,
-            innovation=innovation,
-            plausible=plausible,
-            forced=forced,
-            lost=jnp.any(lost),
+        xi = jnp.where(late, expected + off, xi)
+
+        # A yaw that is off stays off by the same angle, and so does one relative to
+        # the wrong place of a bend: its changes are still measured.
+        turned = innovation[HEADING]
+        stays = jnp.abs(wrap_angle(turned - state.skew)) <= grown[HEADING]
+        skew = jnp.where((state.skew != 0.0) & stays, state.skew, turned)
+        skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
+        heading = jnp.where(skewed, coordinates[HEADING] - skew, xi[HEADING])
+        xi = xi.at[HEADING].set(heading)
+
+        # A believed outlier starts anew; noise is averaged.
+        estimate = expected + self.gain * _difference(xi, expected)
+        estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
+        here = jnp.append(estimate, preview.road[0, 0])
+        past = jnp.where(late, past, state.past)
+        lost = (missing > longest) & ~usable
+        after = state._replace(
+            along=jnp.where(jnp.all(measured), preview.along, state.along),
+            missing=missing,
             skew=jnp.where(skewed, skew, 0.0),
+            doubt=jnp.where(forced, round(self.trial / self.dt), state.doubt),
+            past=jnp.concatenate([here[None], past[:-1]]),
         )
+        return xi, measured, jnp.any(lost), after
+
+    def _earlier(
+        self, state: GateState, xi: PathState, curvature: Scalar, gap: Scalar
+    ) -> tuple[PathState, PathState, Float[Array, "step coordinate+1"]]:
+        """A measurement that lies behind on the path, as one of an earlier step.
+
+        Returns:
+            What it differs by from the estimate of that step, NaN if none was there;
+            what the estimate of now then differs by; the past, corrected by it.
+        """
+        past, bends = state.past[:, :-1], state.past[:, -1]
+        steps = self.dt * past[:, PATH_SPEED]
+        behind = jnp.cumsum(steps)
+        miss = jnp.nan_to_num(jnp.abs(behind + gap), nan=jnp.inf)
+        which = jnp.argmin(miss)
+        # ξ is relative to the circle of the road here, which was another one there.
+        turned = jnp.cumsum((bends - curvature) * steps)
+        then = past.at[:, HEADING].add(-turned)[which]
+        then = then.at[LATERAL].add(jnp.cumsum(turned * steps)[which])
+        off = _difference(xi, then)
+        off = jnp.where(miss[which] <= 0.6 * jnp.abs(steps[which]) + 0.1, off, jnp.nan)
+        # Where it was wrong about the heading it went on into the wrong direction.
+        kept = off.at[PATH_SPEED + 1 :].set(0.0)
+
+        def gone_on(distance: Scalar) -> PathState:
+            return kept.at[LATERAL].add(distance * off[HEADING])
+
+        later = jnp.arange(len(behind)) <= which
+        change = self.gain * jax.vmap(gone_on)(behind[which] - behind)
+        corrected = past + jnp.where(later[:, None], change, 0.0)
+        corrected = jnp.concatenate([corrected, bends[:, None]], axis=1)
+        return off, gone_on(behind[which]), corrected
 
     def _reach(self, state: GateState, periods: Scalar) -> Scalar:
         """How far the vehicle gets in a step, and somewhat more [m]."""
@@ -360,46 +390,40 @@ class Gate:
         """The test with what the next measurement is compared with."""
         if state is None:
             return None
-        control, road, env = applied
         # What an estimator has found and counteracts is not found again.
         if "causes" in info:
-            control = control + input_error(info["causes"], road)
+            found = input_error(info["causes"], applied.road)
+            applied = applied._replace(control=applied.control + found)
+        expected, inside, usual = self._predict(params, xi, applied)
+        control, road, env = applied
         nearest = self.conditions.nearest(env)
-        fiber = self.model.fiber(fold(self.model, params), nearest)
-        nu = control - self.law(xi, road[0], road[1], nearest)
-        expected = expected_coordinates(self.model, fiber, xi, nu, road)
         turned = self.dt * turning_rate(self.law, xi, control, road, nearest)
         expected = jnp.append(expected, xi[HEADING] + turned)
-        # Beyond what data and planners add to the law, the model was not learned.
-        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
-        clear &= usual & self.conditions.hold(xi, road)
         return state._replace(
-            expected=jnp.where(clear, expected, jnp.nan),
+            expected=jnp.where(clear & inside & usual, expected, jnp.nan),
             level=steering_level(self.law, road, nearest),
         )
 
     def _limit(
-        self, state: GateState, expected: PathState, periods: Scalar
+        self, state: GateState, periods: Scalar, on_time: Bool[Array, ""]
     ) -> Float[Array, " coordinate"]:
         """The largest difference that one step explains, entry by entry."""
         # What a vehicle can reach in a step without knowing its model: sideways what
         # it drives, and more than any tyre turns, accelerates and slides.
-        wide = jnp.full(expected.shape, jnp.inf, dtype=float)
+        wide = jnp.full(state.expected.shape, jnp.inf, dtype=float)
         wide = wide.at[HEADING].set(0.35).at[PATH_SPEED].set(1.5)
         wide = wide * jnp.maximum(periods, 1.0)
         wide = wide.at[LATERAL].set(self._reach(state, periods))
-        limit = wide
-        if self.conditions.state is not None:
-            low, high = map(jnp.asarray, self.conditions.state)
-            tight = 0.5 * self.share * (high - low)
-            inside = state.modelled & (jnp.abs(periods - 1.0) < 1e-3)
-            limit = jnp.where(inside, jnp.minimum(tight, wide), limit)
-        return limit
+        if self.conditions.state is None:
+            return wide
+        low, high = map(jnp.asarray, self.conditions.state)
+        tight = jnp.minimum(0.5 * self.share * (high - low), wide)
+        return jnp.where(state.modelled & on_time, tight, wide)
 
     def _predict(
         self, params: Params, xi: PathState, applied: Applied
-    ) -> tuple[PathState, Bool[Array, ""]]:
-        """ξ one step later, and whether it is the model that says so."""
+    ) -> tuple[PathState, Bool[Array, ""], Bool[Array, ""]]:
+        """ξ one step later, whether the model says so, and if ν is as in its data."""
         control, road, env = applied
         model = self.model
         nearest = self.conditions.nearest(env)
@@ -408,21 +432,9 @@ class Gate:
         ahead = expected_coordinates(model, fiber, xi, nu, road)
         inside = self.conditions.hold(xi, road) & all_finite(ahead)
         sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
-        return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside
-
-
-def _heading(
-    state: GateState, xi: PathState, innovation: PathState, limit: Scalar
-) -> tuple[Scalar, Scalar]:
-    """The yaw of a wrong pose, less what is wrong with it, and that.
-
-    A yaw that is off stays off by the same angle, and so does one relative to the
-    wrong place of a bend: its changes are still measured.
-    """
-    off = innovation[HEADING]
-    follows = (state.skew != 0.0) & (jnp.abs(wrap_angle(off - state.skew)) <= limit)
-    skew = jnp.where(follows, state.skew, off)
-    return xi[HEADING] - skew, skew
+        # Beyond what data and planners add to the law, the model was not learned.
+        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+        return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside, usual
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
