@@ -171,6 +171,22 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
     assert info["mine"].shape == lateral.shape
 
 
+def test_a_planner_in_a_guard_sees_what_the_gate_believes():
+    """The observation bit for bit, or where the car would be, if that has jumped."""
+    trained = load("kinematic_path")
+    plan = lambda params, state, x, env, road: (jnp.zeros(2), state, {"seen": x})
+    guarded = trained.guard(Controller(lambda key: (), plan))
+    state, act = guarded.init(KEY), jax.jit(guarded.act)
+    x, faults = start("kinematic").at[1].set(0.05), {3: [0.0, 3.0, 0.0, 0.0]}
+    faults |= {4: [-7.0, 1.0, 0.3, 0.0], 5: [np.nan] * 4}
+    for k in range(7):
+        told = x + jnp.asarray(faults.get(k, [0.0] * 4))
+        road = straight(20).at[:, 0].add(x[0])
+        u, state, info = act(trained.params, state, told, ENV, road)
+        np.testing.assert_allclose(info["seen"], x, atol=0.1 * (k in faults))
+        x = trained.vehicle.step(x, u, ENV)
+
+
 def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
     with pytest.raises(ValueError, match="no certified corridor"):
         load("dynamic").guard(scripted(jnp.zeros((1, 2))))
@@ -182,7 +198,8 @@ def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
     _, state, info = jax.eval_shape(own.act, trained.params, own.init(KEY), *inputs)
     assert jax.tree.structure(state) == jax.tree.structure(own.init(KEY))
     assert info["predicted_states"].shape == (20, 4)
-    along = trained.guard(control.REQUEST, along_path=True)
+    lawful = control.requesting(scripted(jnp.zeros((1, 2))), 20, 3)
+    along = trained.guard(lawful, along_path=True)
     jax.eval_shape(along.act, trained.params, along.init(KEY), *inputs)
 
 

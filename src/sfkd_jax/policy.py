@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, store
-from sfkd_jax.control import REQUEST, PathLaw, behind, law_from_arrays
+from sfkd_jax.control import PathLaw, behind, law_from_arrays, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.rollout import fold, unfold
@@ -164,8 +164,12 @@ class Policy(TrainedModel):
         self._with_corridor()
         # Its settings are numbers, also where a program is traced when it is built.
         with jax.ensure_compile_time_eval():
-            guard = self.around(planner=planner if along_path else REQUEST)
-        return _entrance(guard if along_path else behind(guard, planner), self)
+            if along_path:
+                return _entrance(self.around(planner=planner), self)
+            horizon = build.controller_horizon(self.settings["controller"])
+            size = len(self.vehicle.state_names) - 1
+            guard = self.around(planner=requesting(planner, horizon, size))
+        return _entrance(behind(guard), self)
 
     def in_lane(
         self, *, car: tuple[float, float] = (4.5, 2.0), planner: str = "mppi"

@@ -23,10 +23,10 @@ from sfkd_jax.control.planners._mppi import mppi as mppi
 from sfkd_jax.control.planners._planner import Planner as Planner
 from sfkd_jax.control.planners._planner import SearchResult as SearchResult
 from sfkd_jax.control.planners._planner import tuned as tuned
-from sfkd_jax.control.tasks._along_path import REQUEST as REQUEST
 from sfkd_jax.control.tasks._along_path import along_reference as along_reference
 from sfkd_jax.control.tasks._along_path import behind as behind
 from sfkd_jax.control.tasks._along_path import following_law as following_law
+from sfkd_jax.control.tasks._along_path import requesting as requesting
 from sfkd_jax.control.tasks._constraints import at_step as at_step
 from sfkd_jax.control.tasks._constraints import constrained as constrained
 from sfkd_jax.control.tasks._constraints import outside_boxes as outside_boxes

@@ -31,12 +31,13 @@ from sfkd_jax.geometry import (
     PATH_SPEED,
     PathState,
     between,
+    compose,
     curvature_ahead,
     followable,
     path_coordinates,
     path_state,
 )
-from sfkd_jax.rollout import fold
+from sfkd_jax.rollout import Offset, fold
 from sfkd_jax.types import (
     BODY,
     POSE,
@@ -59,7 +60,7 @@ class Preview(NamedTuple):
         road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
             finite.
         along: distance of the observed position from the first point of the reference,
-            along the path [m].
+            along the path [m]; behind a `Gate` of the last one that was believed.
         repeated: whether the observation is bit for bit the last one, as of a sensor
             that freezes.
         measured: which entries of ξ are measured; behind a `Gate` the others are
@@ -277,73 +278,93 @@ def check_preview(coordinates: Any, env: Any, preview: Any, horizon: int) -> Non
 
 
 class Request(NamedTuple):
-    """What a planner in the world asks for: the state of its stand-in along a path."""
+    """State of a planner in the world, and what the world around it is."""
 
-    control: Control
-    healthy: Bool[Array, ""]
-
-
-class BehindState(NamedTuple):
-    """States of a planner in the world, and of the guard around its `Request`."""
-
-    planner: Any
-    guard: Any
+    inner: Any
+    observation: State
+    reference: Reference
 
 
 PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
 """Entries of `info` that a planner alone can give."""
+ABOUT = "about"
+"""Entry of `info` that holds the planner's own on its way out of the guard."""
 
 
-def _ask(
-    params: Params, request: Request, xi: PathState, env: Environment, preview: Preview
-) -> tuple[Control, Request, ControllerInfo]:
-    unknown = jnp.asarray(jnp.nan, dtype=float)
-    about: Any = {
-        **dict.fromkeys(PLANNED, unknown),
-        "healthy": request.healthy,
-        "env_inside": jnp.asarray(True),
-        "predicted_states": jnp.full((preview.road.shape[0], xi.shape[0]), unknown),
-    }
-    return request.control, request, about
+def requesting(planner: Controller, horizon: int, coordinates: int) -> Controller:
+    """Return a planner in the world as one along a path, see `behind`.
 
-
-REQUEST = Controller(lambda key: Request(jnp.zeros(2), jnp.asarray(True)), _ask)
-"""A controller along a path that asks for what its state says, see `behind`."""
-
-
-def behind(guard: Controller, planner: Controller) -> Controller:
-    """Return a planner that sees the world behind a guard that sees the path.
+    It observes what the caller does, bit for bit, where all of ξ is measured, and
+    elsewhere the state that a gate believes.
 
     Args:
-        guard: in the world, with `REQUEST` in it at any depth.
-        planner: any; entries of its `info` appear in that of the guard.
+        planner: any.
+        horizon: number of steps of the reference.
+        coordinates: size of ξ.
 
     Raises:
         ValueError: (when called) the planner's control is not that of a vehicle.
     """
 
-    def is_request(node: Any) -> bool:
-        return isinstance(node, Request)
+    def init(key: Key) -> Request:
+        nothing = jnp.zeros(coordinates + 1), jnp.zeros((horizon, 4))
+        return Request(planner.init(key), *nothing)
 
     def act(
-        params: Params, state: BehindState, observation: Any, env: Any, reference: Any
-    ) -> tuple[Control, BehindState, ControllerInfo]:
-        # Before the projection, which loses the pose that the planner needs; what it
-        # asks for travels in the state, past whatever wrapper is between.
-        inputs = observation, env, reference
-        planned, memory, about = planner.act(params, state.planner, *inputs)
+        params: Params, state: Request, xi: PathState, env: Any, preview: Preview
+    ) -> tuple[Control, Request, ControllerInfo]:
+        bend, along = preview.road[0, 0], preview.along
+        left = xi[LATERAL] + 0.5 * bend * along**2
+        motion = jnp.stack([along, left, xi[HEADING] + bend * along])
+        pose = compose(state.reference[0, POSE], motion)
+        believed = jnp.concatenate([pose, xi[PATH_SPEED:]])
+        seen = jnp.where(jnp.all(preview.measured), state.observation, believed)
+        # What an adaptation adds to the model is not that of another planner.
+        own = params.params if isinstance(params, Offset) else params
+        planned, memory, about = planner.act(
+            own, state.inner, seen, env, state.reference
+        )
         planned = jnp.asarray(planned, dtype=float)
         if planned.shape != (2,):
             raise ValueError(f"a planner's control has shape (2,), got {planned.shape}")
-        request = Request(planned, all_finite(planned) & about.get("healthy", True))
-        asked = jax.tree.map(
-            lambda node: request if is_request(node) else node,
-            state.guard,
-            is_leaf=is_request,
+        unknown = jnp.asarray(jnp.nan, dtype=float)
+        info: Any = {
+            **dict.fromkeys(PLANNED, unknown),
+            "healthy": all_finite(planned) & about.get("healthy", True),
+            "env_inside": jnp.asarray(True),
+            "predicted_states": jnp.full((horizon, coordinates), unknown),
+            ABOUT: about,
+        }
+        return planned, state._replace(inner=memory), info
+
+    return Controller(init, act)
+
+
+def behind(guard: Controller) -> Controller:
+    """Return a guard in the world around a planner that is `requesting`, at any depth.
+
+    What the projection loses travels in the state, past whatever wrapper is between;
+    entries of the planner's `info` appear in that of the guard.
+    """
+
+    def act(
+        params: Params, state: Any, observation: Any, env: Any, reference: Any
+    ) -> tuple[Control, Any, ControllerInfo]:
+        world = {"observation": observation, "reference": reference}
+        shown = jax.tree.map(
+            lambda node: node._replace(**world) if _is_request(node) else node,
+            state,
+            is_leaf=_is_request,
         )
-        control, after, info = guard.act(params, asked, *inputs)
+        info: Any
+        control, after, info = guard.act(params, shown, observation, env, reference)
+        about = info.pop(ABOUT)
         known = {name: about[name] for name in PLANNED if name in about}
         merged: Any = {**about, **info, **known}
-        return control, BehindState(memory, after), merged
+        return control, after, merged
 
-    return Controller(lambda key: BehindState(planner.init(key), guard.init(key)), act)
+    return Controller(guard.init, act)
+
+
+def _is_request(node: Any) -> bool:
+    return isinstance(node, Request)

@@ -90,16 +90,6 @@ def mixed(bank: Bank, transition: Float[Array, "filter filter"]) -> Bank:
     return Bank(means, covariances, expected)
 
 
-def propagated(
-    covariances: Float[Array, "filter n n"],
-    slopes: Float[Array, "filter n n"],
-    noise: Float[Array, "filter n n"],
-) -> Float[Array, "filter n n"]:
-    """Return A P Aᵀ + Q of every filter, symmetric in spite of rounding."""
-    after = slopes @ covariances @ slopes.swapaxes(1, 2) + noise
-    return 0.5 * (after + after.swapaxes(1, 2))
-
-
 def corrected(
     bank: Bank,
     measurement: Float[Array, " sensor"],
@@ -363,8 +353,10 @@ class Estimator:
         stays = jnp.eye(bank.means.shape[1])[size:]
         stays = jnp.tile(stays, (means.shape[0], 1, 1))
         slopes = jnp.concatenate([slopes, stays], axis=1)
-        covariances = propagated(bank.covariances, slopes, self.noise)
-        return Bank(means, covariances, bank.probabilities)
+        spread = slopes @ bank.covariances @ slopes.swapaxes(1, 2) + self.noise
+        # Symmetric in spite of rounding.
+        spread = 0.5 * (spread + spread.swapaxes(1, 2))
+        return Bank(means, spread, bank.probabilities)
 
     def _restarted(self, bank: Bank, measured: PathState) -> Bank:
         """The bank at a measured ξ, with the causes as they are."""

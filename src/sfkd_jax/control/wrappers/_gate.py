@@ -226,15 +226,20 @@ class Gate:
 
         xi, measured, lost, after = self._believed(state, coordinates, preview, periods)
         clean, compared = jnp.all(measured), all_finite(state.expected)
-        tested, verdict = self._tested(state, coordinates, measured & clean & on_time)
+        tested, statistic, alarm = None, jnp.asarray(jnp.nan), jnp.asarray(False)
+        if self.test is not None and state.test is not None:
+            used = measured & clean & on_time
+            tested, statistic = self.test.update(state.test, coordinates, used)
+            alarm = tested.alarm
         clear = on_time & readable & env_known
-        trusted = preview.trusted & clear & (after.doubt == 0)
-        trusted &= ~verdict["innovation_alarm"]
+        trusted = preview.trusted & clear & (after.doubt == 0) & ~alarm
         # Nothing to believe and nothing to rely on: stop.
         slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
         road = jnp.where(lost, road.at[:, 1].set(slower), road)
 
-        seen = preview._replace(road=road, measured=measured, trusted=trusted)
+        seen = preview._replace(
+            road=road, along=after.along, measured=measured, trusted=trusted
+        )
         control, inner, info = self.inner.act(params, state.inner, xi, env, seen)
 
         estimate = after.past[0, :-1]
@@ -249,7 +254,8 @@ class Gate:
             "dead_reckoning": compared & ~clean,
             "innovation": jnp.where(measured, innovation, jnp.nan),
             "path_state": jnp.where(measured, coordinates, jnp.nan),
-            **verdict,
+            "innovation_statistic": statistic,
+            "innovation_alarm": alarm,
             "trusted": trusted,
             "env_inside": info.get("env_inside", True) & env_known,
         }
@@ -367,16 +373,6 @@ class Gate:
         """How far the vehicle gets in a step, and somewhat more [m]."""
         speed = jnp.abs(state.expected[PATH_SPEED])
         return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
-
-    def _tested(
-        self, state: GateState, xi: PathState, measured: Bool[Array, " coordinate"]
-    ) -> tuple[InnovationState | None, dict[str, Array]]:
-        """The test after this measurement, and its entries of `info`."""
-        tested, statistic, alarm = None, jnp.asarray(jnp.nan), jnp.asarray(False)
-        if self.test is not None and state.test is not None:
-            tested, statistic = self.test.update(state.test, xi, measured)
-            alarm = tested.alarm
-        return tested, {"innovation_statistic": statistic, "innovation_alarm": alarm}
 
     def _expect(
         self,
