@@ -25,7 +25,7 @@ from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
 from sfkd_jax.data import Driver
 from sfkd_jax.geometry import PATH_SPEED
-from sfkd_jax.ranges import Positive
+from sfkd_jax.ranges import Positive, imported
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -87,8 +87,9 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     settings = parse(VehicleSettings, settings, "vehicle.")
     factory: Callable[..., plants.Vehicle] = PLANTS[settings.name]
     options = arguments(settings, factory)
-    if options.get("step") is not None:
-        options["step"] = plants.step_named(options["step"])
+    if (name := options.get("step")) is not None:
+        # At the call: a plant may be described where its code is not installed.
+        options["step"] = lambda *inputs: imported(name, "vehicle.step")(*inputs)
     plant = factory(**options)
     if settings.inner_loop == "none":
         return plant
@@ -266,8 +267,7 @@ class LawSettings:
 
 def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
     """Return the closed loop of plant and law, in the coordinates of `path_frame`."""
-    steering, drive = (float(largest) for largest in law.perturbation)
-    return plants.along_path(plant, law, perturbation=(steering, drive))
+    return plants.along_path(plant, law, perturbation=law.perturbation)
 
 
 class System(NamedTuple):

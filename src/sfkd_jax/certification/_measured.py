@@ -176,16 +176,12 @@ def coverage(
     They were cut from `runs` independent runs; by default every trajectory is one.
     """
     share = float(np.mean(np.all(held_out <= bounds, axis=1)))
-    return counted(share, len(held_out), runs or len(held_out))
-
-
-def counted(share: float, trajectories: int, runs: int) -> dict[str, Any]:
-    """Return a coverage with its 95 % interval and its counts, as the document does."""
+    runs = runs or len(held_out)
     return {
         "coverage": share,
         # Segments of one run are dependent: the interval is of independent runs.
         "coverage_ci95": coverage_interval(share, runs),
-        "coverage_trajectories": trajectories,
+        "coverage_trajectories": len(held_out),
         "coverage_runs": runs,
     }
 

@@ -106,8 +106,7 @@ def closed_loop(
             "model.frame=path"
         )
     folded = jax.jit(partial(fold, model))(params)
-    steering, speed = (float(largest) for largest in law.perturbation)
-    closed = along_path(plant, law, perturbation=(steering, speed))
+    closed = along_path(plant, law, perturbation=law.perturbation)
     return Loop(closed, law, model, folded, tuple(noise))
 
 

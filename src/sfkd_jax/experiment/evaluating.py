@@ -212,7 +212,7 @@ class SystemEvaluation:
             driven = known._replace(envs=envs)
         episode = self._simulate(driven, episodes.keys)
         scores = evaluation.score(episode, dt=self._plant.dt)
-        violation = dict.fromkeys(("v0", "v1"))
+        violation: dict[str, Any] = dict.fromkeys(("v0", "v1"))
         # A prediction needs as many steps as a segment of the data set has.
         long = episode.controls.shape[1] >= self._settings.dataset.steps
         if long and self._claims:

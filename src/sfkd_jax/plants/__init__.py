@@ -5,7 +5,6 @@ from sfkd_jax.plants._kinematic import kinematic as kinematic
 from sfkd_jax.plants._kinematic import kinematic_stiff as kinematic_stiff
 from sfkd_jax.plants._own import check_step as check_step
 from sfkd_jax.plants._own import own as own
-from sfkd_jax.plants._own import step_named as step_named
 from sfkd_jax.plants._vehicle import Vehicle as Vehicle
 from sfkd_jax.plants._vehicle import along_path as along_path
 from sfkd_jax.plants._vehicle import equivalent_wind as equivalent_wind

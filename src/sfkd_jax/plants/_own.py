@@ -6,12 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.plants._vehicle import Vehicle, nominal_derivative, rk4
-from sfkd_jax.ranges import Bounds, Positive, imported
+from sfkd_jax.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
-
-
-class _MissingStep(ValueError):
-    """There is no step to evaluate; the message names the setting."""
 
 
 def own(
@@ -77,24 +73,10 @@ def own(
 
 def _no_step(state: State, control: Control, env: Environment) -> State:
     """The step of a vehicle that is known from logs alone."""
-    raise _MissingStep(
+    raise ValueError(
         "vehicle=own is known from logs alone, so it cannot be simulated: "
         "pass vehicle.step=module:function"
     )
-
-
-def step_named(name: str) -> Step:
-    """Return the step "package.module:function", imported at its first call."""
-
-    def step(state: State, control: Control, env: Environment) -> State:
-        # At the call: a plant may be described where its code is not installed.
-        try:
-            function = imported(name, "vehicle.step")
-        except ValueError as reason:
-            raise _MissingStep(str(reason)) from None
-        return function(state, control, env)
-
-    return step
 
 
 def check_step(plant: Vehicle) -> None:
@@ -104,9 +86,6 @@ def check_step(plant: Vehicle) -> None:
     try:
         after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, 2)))
     except Exception as reason:  # a function of the user raises anything
-        # Its message names the setting already; the one below would hide it.
-        if isinstance(reason, _MissingStep):
-            raise
         first = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
             f"the step of vehicle {plant.name} fails on {given}: {first}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -168,7 +169,7 @@ def along_path(
     vehicle: Vehicle,
     law: PathFeedback,
     *,
-    perturbation: tuple[float, float] = (0.03, 1.0),
+    perturbation: Iterable[float | Scalar] = (0.03, 1.0),
 ) -> Vehicle:
     """Return the closed loop as a plant with states (0, 0, 0, ξ) and controls w.
 
@@ -189,6 +190,7 @@ def along_path(
     # The loop clips what the law and ν ask for together, as the car does.
     limits = (vehicle.control_low, vehicle.control_high)
     nominal = closed_loop(vehicle.nominal, law, *limits)
+    largest = tuple(map(float, perturbation))
 
     def nominal_derivative(state: State, control: Control, env: Environment) -> State:
         # A difference quotient: the loop is defined by its step, with the control held.
@@ -201,6 +203,6 @@ def along_path(
         nominal=nominal,
         nominal_derivative=nominal_derivative,
         # Limits of w as boxes to draw from; the loop itself clips only the control.
-        control_low=(*(-most for most in perturbation), -STEEPEST, SPEED_RANGE[0]),
-        control_high=(*perturbation, STEEPEST, SPEED_RANGE[1]),
+        control_low=(*(-most for most in largest), -STEEPEST, SPEED_RANGE[0]),
+        control_high=(*largest, STEEPEST, SPEED_RANGE[1]),
     )

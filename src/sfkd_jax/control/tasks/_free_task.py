@@ -97,15 +97,10 @@ class FreeTask:
         # Before the first control, slew limits count from rest.
         rest = self.limit(jnp.zeros_like(start.control), start.control)
         before = jnp.where(start.known, start.control, rest)
-        state = jax.tree.map(jnp.asarray, observation)
         # Integers become real if the dynamics make them so: a scan keeps types.
-        after = jax.eval_shape(self.dynamics, params, state, before, env)
+        after = jax.eval_shape(self.dynamics, params, observation, before, env)
         state = jax.tree.map(
-            lambda leaf, like: (
-                leaf if leaf.dtype == like.dtype else leaf.astype(like.dtype)
-            ),
-            state,
-            after,
+            lambda leaf, like: jnp.asarray(leaf, like.dtype), observation, after
         )
         return RolloutSetup((params, env), FreeSample(state, before), reference)
 

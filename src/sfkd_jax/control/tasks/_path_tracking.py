@@ -25,7 +25,6 @@ from sfkd_jax.control.laws._recovery import (
     admitted,
 )
 from sfkd_jax.control.tasks._task import (
-    Environments,
     Limiter,
     PlanningStart,
     RolloutSetup,
@@ -304,7 +303,7 @@ path_tracking = factory(PathTracking, lambda around: around.task(check_path))
 
 
 def check_path(
-    observation: State, env: Environments, reference: Any, horizon: int
+    observation: State, env: Environment, reference: Any, horizon: int
 ) -> Bool[Array, ""]:
     """Return `is_precise`; a ValueError names an argument of the wrong shape."""
     if observation.ndim != 1 or observation.shape[0] < 4:
@@ -312,10 +311,8 @@ def check_path(
             "observation must be (p_x, p_y, yaw, v, …), shape (nx,), "
             f"got {observation.shape}"
         )
-    if env.ndim not in (1, 2):
-        raise ValueError(
-            f"env must have shape (ne,), or (particle, ne), got {env.shape}"
-        )
+    if env.ndim != 1:
+        raise ValueError(f"env must have shape (ne,), got {env.shape}")
     if reference.shape != (horizon, 4):
         raise ValueError(
             f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "

@@ -8,12 +8,10 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from sfkd_jax.types import Control, Params, Scalar
 
-Environments: TypeAlias = Float[Array, "*particle environment"]
-"""One environment, or several that are equally likely."""
 Limiter: TypeAlias = Callable[[Control, Control], Control]
 """(wanted control, control before) -> the nearest control that the actuators allow."""
 Limit: TypeAlias = ArrayLike | Sequence[float]

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._networks import SMALL, Biases, Sandwich, Weights, bounded
-from sfkd_jax.models.sfkd._residual import Residual, separate_budget, share_budget
+from sfkd_jax.models._networks import SMALL, Biases, Free, Sandwich, Weights, bounded
+from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
 from sfkd_jax.types import Scalar
 
 LOWEST_RATE = 0.5
@@ -72,7 +72,7 @@ class Learned(Networks):
     """Embedding ψ(e), operators, residual, decoder and transport; fields as of `sfkd`.
 
     Attributes:
-        kind: of the residual.
+        kind: of the residual, see `RESIDUALS`.
         joint: whether operators and residual are bounded as one map by α = ρ + β;
             otherwise A(e) is bounded by ρ and the residual by β.
     """
@@ -82,7 +82,7 @@ class Learned(Networks):
     decoder_hidden: Sequence[int]
     rho: float
     beta: float
-    kind: Residual
+    kind: type[Sandwich] | type[Free] | None
     joint: bool
     learn_alpha: bool
     forcing_hidden: int
@@ -98,10 +98,9 @@ class Learned(Networks):
         self.input_head = nn.Dense(self.rank * self.control)
         self.tangent_head = nn.Dense(self.rank // 2, kernel_init=SMALL)
         # Weights of networks do not depend on e, only biases do: one bound for all e.
-        if self.kind.network is not None:
-            self.residual_weights = self.kind.network(
-                self.rank, self.residual_hidden, self.rank
-            )
+        if self.kind is not None:
+            sizes = self.rank, self.residual_hidden, self.rank
+            self.residual_weights = self.kind(*sizes)
             self.residual_head = nn.Dense(
                 self._bias_size(self.residual_hidden, self.rank), kernel_init=SMALL
             )
@@ -139,7 +138,7 @@ class Learned(Networks):
     @property
     def bounded(self) -> bool:
         """Whether a step contracts by construction."""
-        return self.kind.bounded
+        return self.kind is not Free
 
     def rate(self) -> Scalar:
         """Return α = ρ + β, or less if it is learned."""
@@ -163,7 +162,7 @@ class Learned(Networks):
             )
         else:
             vertices, residual = separate_budget(self.operators, self.rho), Weights()
-            if self.kind.network is not None:
+            if self.kind is not None:
                 residual = self.residual_weights(self.beta)
         decoder = Weights()
         if self.pose:
@@ -183,7 +182,7 @@ class Learned(Networks):
         """Return the functions of e; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
         residual = decoder = forcing = Biases()
-        if self.kind.network is not None:
+        if self.kind is not None:
             widths = (*self.residual_hidden, self.rank)
             residual = self._biases(self.residual_head(embedding), widths)
         if self.pose:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._networks import FRAMES, Encoder, apply
+from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
@@ -300,12 +300,11 @@ def sfkd(
     check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
     check_choice("model.budget", budget, BUDGETS)
-    # The one look-up: everything below asks the kind, never its name.
     kind = RESIDUALS[residual]
     # Planes are pairs of coordinates; of an odd number one would be left over.
     if rank % 2:
         raise ValueError(f"model.rank must be even, got {rank}")
-    if soft_penalty and kind.network is None:
+    if soft_penalty and kind is None:
         raise ValueError("model.soft_penalty needs a residual, got model.residual=none")
     learned = Learned(
         rank=rank,
@@ -319,7 +318,7 @@ def sfkd(
         beta=beta,
         kind=kind,
         # A residual without a bound has none that could be shared.
-        joint=budget == "joint" and kind.bounded and kind.network is not None,
+        joint=budget == "joint" and kind is Sandwich,
         transport=transport,
         # Along a path the offsets are part of s, and there is no pose to decode.
         pose=frame != "path",

@@ -8,10 +8,6 @@ certificate is about, would be added in `LatentModel.step` and left out of `expl
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -26,25 +22,10 @@ float32.
 BUDGETS = ("joint", "sum")
 
 
-class Residual(NamedTuple):
-    """A kind of residual r(z; u, e).
-
-    Attributes:
-        network: (inputs, hidden widths, outputs) -> flax module that returns `Weights`
-            for a Lipschitz bound; None: there is no residual.
-        bounded: whether a step contracts by construction. If not, a certificate exists
-            only if its search finds one.
-    """
-
-    network: Callable[..., nn.Module] | None
-    bounded: bool
-
-
-RESIDUALS = {
-    "sandwich": Residual(Sandwich, bounded=True),
-    "free": Residual(Free, bounded=False),
-    "none": Residual(None, bounded=True),
-}
+RESIDUALS = {"sandwich": Sandwich, "free": Free, "none": None}
+"""(inputs, hidden widths, outputs) -> flax module, by name; None: no residual. A step
+with a `Free` one does not contract by construction.
+"""
 
 
 def separate_budget(
