@@ -12,7 +12,6 @@ from helpers import dataset, jit, model_and_params
 from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax import data as datasets
 from sfkd_jax.control import StageInputs
-from sfkd_jax.control.planners import _koopman_mpc
 from sfkd_jax.control.planners._koopman_mpc import box_qp
 
 PLANT = plants.kinematic()
@@ -54,52 +53,6 @@ def act(observation=OFFSET, state=None):
     controller, run = compiled()
     state = controller.init(jax.random.key(0)) if state is None else state
     return run(koopman()[1], state, observation, ENV, BEND)
-
-
-@cache
-def quadratic_programs():
-    """(H, f, low, high, start) of three consecutive steps as the solver receives them;
-    the first is far off the path.
-    """
-    params, controller = koopman()[1], compiled()[0]
-    saved, solve = [], _koopman_mpc.box_qp
-
-    @jit
-    def record(state, observation):
-        _, state, _ = controller.act(params, state, observation, ENV, BEND)
-        return state, saved[0]
-
-    def recorded(*data, **options):
-        saved.append(data)
-        return solve(*data, **options)
-
-    programs, state = [], controller.init(jax.random.key(0))
-    far = jnp.asarray([0.0, 6.0, 0.0, 4.0])
-    try:
-        _koopman_mpc.box_qp = recorded
-        for observation in (far, OFFSET, OFFSET.at[1].add(-0.02)):
-            state, program = record(state, observation)
-            programs.append(program)
-    finally:
-        _koopman_mpc.box_qp = solve
-    return [[np.asarray(part, np.float64) for part in data] for data in programs]
-
-
-def residual(x, H, f, low, high):
-    """The largest move of a scaled step of projected descent: 0 at the optimum."""
-    moved = np.clip(x - (H @ x + f) / np.diagonal(H), low, high)
-    return np.max(np.abs(x - moved))
-
-
-@pytest.mark.parametrize("step", range(3))
-def test_the_condensed_problem_is_solved_as_by_a_convex_solver(step):
-    H, f, low, high, start = quadratic_programs()[step]
-    data = [np.float32(part) for part in (H, f, low, high, start)]
-    solution = jit(box_qp)(*data)
-    best = cost(H, f, by_clarabel(H, f, low, high))
-    assert abs(cost(H, f, solution) - best) <= 1e-4 * abs(best)
-    assert residual(solution, H, f, low, high) < 1e-3
-    assert step > 0 or np.any(solution == np.float32(high))  # bounds matter
 
 
 def test_the_cost_is_the_tracking_cost_of_what_is_predicted():
@@ -200,6 +153,12 @@ def by_clarabel(H, f, low, high):
     return x.value
 
 
+def residual(x, H, f, low, high):
+    """The largest move of a scaled step of projected descent: 0 at the optimum."""
+    moved = np.clip(x - (H @ x + f) / np.diagonal(H), low, high)
+    return np.max(np.abs(x - moved))
+
+
 ITERATE = jit(partial(box_qp, iterations=1))
 
 
@@ -209,6 +168,15 @@ def solved(data, start, iterations=12):
     for _ in range(iterations):
         x = ITERATE(*data, x)
     return x
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_quadratic_program_is_solved_as_by_a_convex_solver(seed):
+    data = problem(seed)
+    solution, best = solved(data, np.zeros(SIZE)), by_clarabel(*data)
+    assert abs(cost(*data[:2], solution) - cost(*data[:2], best)) <= 1e-4
+    assert residual(solution, *data) < 1e-3
+    assert np.any(solution == data[3])  # bounds matter
 
 
 def test_the_cost_never_rises_and_the_box_is_never_left():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, certified, explicit, jit, model_and_params
 
-from sfkd_jax.certification import attack_model, lipschitz_upper
+from sfkd_jax.certification import lipschitz_upper
 from sfkd_jax.certification._attack import attack_slopes
 from sfkd_jax.models._networks import Sandwich, Weights, bounded, gram_bound
 from sfkd_jax.models.sfkd._model import rotate_planes
@@ -108,15 +108,6 @@ def test_the_operator_is_bounded_for_every_environment_and_every_weight(name):
         # And the bound is used, not wasted.
         vertices = explicit(name, scale).operators.vertices
         assert np.all(spectral(vertices) > 0.97 * RHO)
-
-
-def test_the_step_keeps_its_factor_under_attack():
-    """Gradient ascent over z, u, e and e' on the slope of the running model."""
-    attacked = attack_model(
-        *model_and_params("sfkd", 30.0), (ENV_LOW, ENV_HIGH), starts=2
-    )
-    assert attacked["step"] <= (RHO + BETA) * (1 + MARGIN)
-    assert attacked["transport"] <= 1 + MARGIN
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0])
