@@ -78,7 +78,13 @@ def split(
     """Split a batch at random into training, validation, calibration and test.
 
     An empty part, numbers that are not finite and an environment outside E are refused.
-    `scenarios` are indices into `SCENARIOS`, one of every trajectory.
+
+    Args:
+        trajectories: a batch, states (segment, T + 1, state).
+        shares: of the four parts, positive and of sum 1.
+        env_low: lower corner of E, in units of e.
+        env_high: upper corner of E.
+        scenarios: index into `SCENARIOS` of every trajectory, or None.
     """
     check_shares(shares)
     count = trajectories.states.shape[0]
@@ -332,7 +338,12 @@ def to_path(
 
     Each state is projected onto the path by Newton steps from the foot point of the
     state before, the first one from the nearest sample of the path. κ_k is the turn of
-    the path between two foot points over their distance. `speeds` are v_ref [m/s].
+    the path between two foot points over their distance.
+
+    Args:
+        driven: states (T + 1, state) in the world, applied controls, environments.
+        law: (ξ, κ, v_ref, e) -> u, not clipped.
+        speeds: v_ref [m/s], (T,).
     """
     states = driven.states
 

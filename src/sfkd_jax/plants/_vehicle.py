@@ -65,7 +65,13 @@ def side_force(wind: Scalar, *, wind_force: float) -> Scalar:
 
 
 def equivalent_wind(wind: Scalar, force: Scalar, *, wind_force: float) -> Scalar:
-    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F for a force F [N]."""
+    """Return the wind w' [m/s] with c_w w'|w'| = c_w w|w| + F.
+
+    Args:
+        wind: w [m/s].
+        force: F [N].
+        wind_force: c_w [N s²/m²].
+    """
     # Forces add, winds do not: the law is a signed square.
     total = side_force(wind, wind_force=wind_force) + force
     # Exactly the same wind without a force, so that not a bit of an episode changes.
@@ -107,8 +113,12 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
     """Return RK4 steps of a car that brakes cannot reverse: v ≥ 0 after every step.
 
     The derivative is evaluated at max(v, 0), so that a car whose v falls below 0 within
-    a step stands: neither its position nor its yaw moves backwards. The sampling period
-    dt [s] has `substeps` integration steps.
+    a step stands: neither its position nor its yaw moves backwards.
+
+    Args:
+        derivative: (x, u, e) -> dx/dt.
+        dt: sampling period [s].
+        substeps: integration steps per sampling period.
     """
     h = dt / substeps
 

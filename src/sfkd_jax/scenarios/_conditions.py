@@ -23,7 +23,12 @@ HOLD, RAMP = (1.0, 3.0), 0.5
 
 
 def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
-    """S1: one friction level from a range, no wind."""
+    """S1: one friction level from a range, no wind.
+
+    Args:
+        steps: length.
+        friction: range [-].
+    """
     level = _within(friction, key)
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
 
@@ -39,7 +44,12 @@ def wet_road(
 ) -> Schedule:
     """S2: friction drops abruptly once, while smooth gusts blow.
 
-    `before` and `after` are ranges of the friction, `drop_time` that of the drop [s].
+    Args:
+        steps: length.
+        dt: sampling period [s].
+        before: range of the friction before the drop [-].
+        after: range of the friction after it [-].
+        drop_time: range of its time [s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
     high, low = _within(before, before_key), _within(after, after_key)
@@ -50,7 +60,12 @@ def wet_road(
 
 
 def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
-    """S3: the next of the levels A, B, C, B, A, … every period, wind side random."""
+    """S3: the next of the levels A, B, C, B, A, … every period, wind side random.
+
+    Args:
+        steps: length.
+        dt: sampling period [s].
+    """
     # One visit more, for the rest of a period at the end.
     visits = int(steps * dt / SWITCH_PERIOD) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
@@ -65,19 +80,30 @@ def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
 def random_side_forces(
     key: Key, *, steps: int, dt: float, largest: float | Scalar, hold: float = 1.0
 ) -> Float[Array, " time"]:
-    """Draw unmeasured side forces up to `largest` [N], each constant for `hold` [s].
+    """Draw unmeasured side forces, uniform in [-F, F], each constant for a while [N].
 
-    The same key gives the same forces at every size, up to the factor.
+    Args:
+        key: consumed; the same key gives the same forces at every F, up to the factor.
+        steps: length.
+        dt: sampling period [s].
+        largest: F [N].
+        hold: duration of a level [s].
     """
     # In whole steps: a force that changed within a step would not be held by it.
     each = round(hold / dt)
-    # Shares of the largest: the same pushes at every size.
+    # Shares of F: the same pushes at every size.
     levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
     return largest * jnp.repeat(levels, each)[:steps]
 
 
 def gusts(key: Key, *, steps: int, dt: float, peak: float) -> Float[Array, " time"]:
-    """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s]."""
+    """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s].
+
+    Args:
+        steps: length.
+        dt: sampling period [s].
+        peak: [m/s].
+    """
     level_key, hold_key = jax.random.split(key)
     # Enough for the shortest holds; what is beyond the end is not used.
     count = int(steps * dt / HOLD[0]) + 2
@@ -99,6 +125,11 @@ def held_road(
     """One constant environment from the box E.
 
     Each entry is uniform in its range or, with probability 1/3, at one of its ends.
+
+    Args:
+        steps: length.
+        low: lower corner of E, in units of e.
+        high: upper corner of E.
     """
     return jnp.tile(_from_box(key, low, high), (steps, 1))
 
@@ -112,7 +143,15 @@ def random_switching(
     high: Corner,
     dwell: Range = (3.0, 6.0),
 ) -> Float[Array, "time environment"]:
-    """Environments from the box E, as in `held_road`, each held for a `dwell` [s]."""
+    """Environments from the box E, as in `held_road`, each held for some time.
+
+    Args:
+        steps: length.
+        dt: sampling period [s].
+        low: lower corner of E, (environment,), in units of e.
+        high: upper corner of E.
+        dwell: range of the time between two switches [s].
+    """
     level_key, hold_key = jax.random.split(key)
     # One level more than the shortest dwells need.
     count = int(steps * dt / dwell[0]) + 2
