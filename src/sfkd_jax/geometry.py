@@ -232,6 +232,14 @@ def path_state(coordinates: PathState) -> State:
     return jnp.concatenate([jnp.zeros(3), coordinates])
 
 
+def beside(coordinates: PathState, point: Float[Array, " 4"]) -> State:
+    """Return the state beside a reference point, on the normal of the path there."""
+    normal = jnp.stack([-jnp.sin(point[2]), jnp.cos(point[2])])
+    position = point[:2] + coordinates[LATERAL] * normal
+    yaw = point[2] + coordinates[HEADING]
+    return jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
+
+
 def vehicle_state(coordinates: PathState) -> State:
     """Return the vehicle's state in the foot frame: pose (0, e_y, e_ψ), body s."""
     return jnp.concatenate([jnp.zeros(1), coordinates])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import between, compose, wrap_angle
+from sfkd_jax.geometry import between, circle_errors, compose
 from sfkd_jax.ranges import AtLeastTwo, NonNegativeInt, Positive
 from sfkd_jax.types import (
     BODY,
@@ -280,12 +280,10 @@ def along_circle(
 ) -> Float[Array, "time state"]:
     """Return states relative to a circle from which the first one has a given offset.
 
-        e_y = (2Y − κ (X² + Y²)) / (1 + D),   s = atan2(κX, 1 − κY) / κ,
-        e_ψ = Θ − κ s,   D = |(κX, 1 − κY)|,
+        s = atan2(κX, 1 − κY) / κ,   e_y and e_ψ of `circle_errors`,
 
     (X, Y, Θ) the pose in the frame of the circle's point closest to the first state.
-    Returns (s, e_y, e_ψ, body state) at every time: exact, and finite up to the centre
-    of the circle.
+    Returns (s, e_y, e_ψ, body state) at every time.
 
     Args:
         states: x_0 … x_T.
@@ -300,16 +298,10 @@ def along_circle(
     foot = compose(tangent, jnp.stack([jnp.zeros(()), -offset[0], jnp.zeros(())]))
 
     def one(state: State) -> State:
-        x, y, yaw = between(foot, state[POSE])
-        across, along = 1.0 - kappa * y, kappa * x
-        turned = jnp.arctan2(along, across)
-        # Not the radius minus a distance: two large numbers that cancel in float32.
-        left = (2.0 * y - kappa * (x**2 + y**2)) / (1.0 + jnp.hypot(along, across))
-        return jnp.concatenate(
-            # An arc of the angle, exact for large
-            # turns, where a chord would be too short.
-            [jnp.stack([turned / kappa, left, wrap_angle(yaw - turned)]), state[BODY]]
-        )
+        pose = between(foot, state[POSE])
+        # An arc of the angle, exact for large turns, where a chord would be too short.
+        arc = jnp.arctan2(kappa * pose[0], 1.0 - kappa * pose[1]) / kappa
+        return jnp.stack([arc, *circle_errors(pose, kappa), *state[BODY]])
 
     return jax.vmap(one)(states)
 

@@ -27,11 +27,10 @@ from sfkd_jax.control.tasks._task import (
     StepResult,
     Task,
 )
-from sfkd_jax.geometry import between, compose, followable, reference_curvature
+from sfkd_jax.geometry import beside, followable, reference_curvature
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
     BODY,
-    POSE,
     Control,
     Controller,
     Environment,
@@ -39,7 +38,6 @@ from sfkd_jax.types import (
     LinearPredictor,
     Model,
     Params,
-    Pose,
     Reference,
     Scalar,
     State,
@@ -115,15 +113,10 @@ class _LiftedSample(NamedTuple):
 
 
 class _LiftedTarget(NamedTuple):
-    """The reference of one step, its curvature there and averaged over the step [1/m].
-
-    `behind` is the distance along the path from the point to the start of the plan [m].
-    """
+    """The reference of one step, and its curvature averaged over the step [1/m]."""
 
     point: Float[Array, "*horizon 4"]
-    at: Float[Array, "*horizon"]
-    over: Float[Array, "*horizon"]
-    behind: Float[Array, "*horizon"]
+    curvature: Float[Array, "*horizon"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +147,8 @@ class _LiftedTracking:
         first = _LiftedSample(predictor.lift(state), errors, *start)
         # The first step has the curvature of the first point, others that of both ends.
         mean = 0.5 * (curvature[1:] + curvature[:-1])
-        steps = jnp.hypot(*jnp.diff(reference[:, :2], axis=0).T)
-        passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
-        behind = between(reference[0, POSE], observation[POSE])[0] - passed
         over = jnp.concatenate([curvature[:1], mean])
-        targets = _LiftedTarget(reference, curvature, over, behind)
+        targets = _LiftedTarget(reference, over)
         return RolloutSetup(predictor._replace(lift=None), first, targets, known)
 
     def step(
@@ -172,7 +162,7 @@ class _LiftedTracking:
     ) -> StepResult:
         """Return one step of the prediction and its cost."""
         z = predictor.A @ before.z + predictor.B @ u
-        z = z + predictor.d * target.over + predictor.c
+        z = z + predictor.d * target.curvature + predictor.c
         x = predictor.C @ z + predictor.o
         speed = target.point[3]
         errors = PathErrors(x[1], x[2], x[3] - speed)
@@ -181,16 +171,8 @@ class _LiftedTracking:
         stage = StageInputs(errors, before.errors, u, last, speed)
         cost = self.cost.stage(weights, stage) * (1.0 + self.terminal_weight * at.last)
         sample = _LiftedSample(z, errors, u, jnp.ones_like(before.known))
-        state = jnp.concatenate([_in_world(x, target), x[BODY]])
-        return StepResult(sample, cost, u, u, state)
-
-
-def _in_world(x: State, target: _LiftedTarget) -> Pose:
-    """The pose of a predicted state, by the circle that touches the reference point."""
-    ahead, kappa = target.behind + x[0], target.at
-    foot = jnp.stack([ahead, 0.5 * kappa * ahead**2, kappa * ahead])
-    aside = jnp.stack([jnp.zeros(()), x[1], x[2]])
-    return compose(target.point[:3], compose(foot, aside))
+        # Without the progress: beside the reference point, as all planners report it.
+        return StepResult(sample, cost, u, u, beside(x[1:], target.point))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

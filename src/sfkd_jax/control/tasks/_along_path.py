@@ -30,6 +30,7 @@ from sfkd_jax.geometry import (
     LATERAL,
     PATH_SPEED,
     PathState,
+    beside,
     between,
     compose,
     curvature_ahead,
@@ -148,20 +149,12 @@ class AlongReference:
         info["precision"] = precise
         if "healthy" in info:
             info["healthy"] &= precise & known
-        info["predicted_states"] = jax.vmap(_in_world)(planned, reference)
+        info["predicted_states"] = jax.vmap(beside)(planned, reference)
         return control, AlongReferenceState(inner, observation), info
 
 
 along_reference = factory(AlongReference, AlongReference.controller)
 """(controller along a path, coordinates=size of ξ) -> `Controller` in the world."""
-
-
-def _in_world(coordinates: PathState, point: Float[Array, " 4"]) -> State:
-    """The state beside a reference point, on the normal of the path there."""
-    normal = jnp.stack([-jnp.sin(point[2]), jnp.cos(point[2])])
-    position = point[:2] + coordinates[LATERAL] * normal
-    yaw = point[2] + coordinates[HEADING]
-    return jnp.concatenate([position, yaw[None], coordinates[PATH_SPEED:]])
 
 
 class AlongSample(NamedTuple):
