@@ -51,7 +51,7 @@ def test_a_stranger_adds_a_row_as_the_example_says(tmp_path):
         "comparison.seeds=[0]",
         "evaluation.episodes=2",
     )
-    small += ("evaluation.episode_s=12", "evaluation.timed_steps=0")
+    small += ("evaluation.episode_s=12",)
     small += ("comparison.controllers={mppi: [s3]}", "comparison.only=[oracle,mine]")
     small += ("dataset=tiny", "training.steps=50", "training.save_every=50")
     small += ("controller.mppi.num_samples=32", "evaluation.systems=[self]")

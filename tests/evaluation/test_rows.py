@@ -16,7 +16,7 @@ def scored(level, count=4):
     return scores
 
 
-def made(level, system, *, count=4, violation=None, act_ms=None, **changes):
+def made(level, system, *, count=4, violation=None, **changes):
     about = {
         "system": system,
         "scenario": "s3",
@@ -26,19 +26,17 @@ def made(level, system, *, count=4, violation=None, act_ms=None, **changes):
         "seeds": [0],
         **changes,
     }
-    return row(scored(level, count), about, act_ms, violation or {})
+    return row(scored(level, count), about, violation or {})
 
 
 def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
-    entry = made(0.1, "sfkd", act_ms=(1.5, 2.5), violation={"v0": 0.0})
+    entry = made(0.1, "sfkd", violation={"v0": 0.0})
     measured = {metric.name for metric in METRICS if metric.measure}
-    given = {"violation", "act_ms", "ratio_to_oracle", "difference_to_sfkd"}
+    given = {"violation", "ratio_to_oracle", "difference_to_sfkd"}
     assert measured | given | {"system", "scenario", "seeds"} <= set(entry)
     np.testing.assert_allclose(entry["rmse_m"]["mean"], 0.115)
     np.testing.assert_allclose(entry["max_deviation_m"], 0.13)
     assert entry["violation"] == {"v0": 0.0}
-    assert entry["act_ms"] == {"p50": 1.5, "p99": 2.5}
-    assert made(2.0, "sfkd")["act_ms"] is None
 
 
 def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():

@@ -126,7 +126,7 @@ def test_hostile_names_are_text_on_every_page(tmp_path):
 def test_enemy_numbers_become_dashes_or_numbers(tmp_path):
     odd = [
         made.row("sfkd", rmse_m={"mean": value, "std": value, "ci95": [value, value]},
-                 max_deviation_m=value, act_ms={"p50": value}, inner_loop=str(value))
+                 max_deviation_m=value, violation={"v0": value}, inner_loop=str(value))
         for value in (None, 1e308, 5e-324, 0.0, -0.1, "x")
     ]  # fmt: skip
     run = made.write_run(tmp_path / "r", episodes=False, results={"rows": odd})

@@ -44,7 +44,6 @@ def score(episodes: Episode, *, dt: float) -> Scores:
 def row(
     scores: Scores,
     about: dict[str, Any],
-    act_ms: tuple[float, float] | None,
     violation: dict[str, Any],
 ) -> Row:
     """One system on one scenario; what does not apply is None.
@@ -53,13 +52,10 @@ def row(
         scores: per episode.
         about: system, model, controller, sampling, env, scenario, vehicle, seeds,
             episodes, episode_s, params.
-        act_ms: median and 99 % quantile of one control step.
         violation: from `violations`.
     """
-    times = None if act_ms is None else {"p50": act_ms[0], "p99": act_ms[1]}
     compared = dict.fromkeys(("ratio_to_oracle", "difference_to_sfkd"))
-    values = _pooled(scores) | {"violation": violation, "act_ms": times}
-    return about | values | compared
+    return about | _pooled(scores) | {"violation": violation} | compared
 
 
 def _pooled(scores: Scores) -> Row:

@@ -223,8 +223,6 @@ METRICS: tuple[Metric, ...] = (
     Metric("mean_speed_mps", "Mean speed", "m/s", "spread", _TWO,
            lambda run: np.mean(run.states[:, 1:, 3], axis=1) + 0.0 * _nearest(run),
            partial(_known, np.mean), records=_GAP),
-    Metric("act_ms.p50", "Control step, median", "ms", "cost", _TWO),
-    Metric("act_ms.p99", "Control step, 99 %", "ms", "cost", _TWO),
     Metric("ratio_to_oracle", "RMSE over oracle", "", "tracking", _TWO),
     Metric("difference_to_sfkd.mean", "RMSE minus SFKD", "mm", "spread", millimetres),
     Metric("difference_to_sfkd.ci95", "95 % interval of the difference", "mm", "spread",

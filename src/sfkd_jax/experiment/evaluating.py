@@ -22,12 +22,9 @@ from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import check_step
 from sfkd_jax.rollout import fold, unfold
-from sfkd_jax.scenarios import Scenario, reference_window
+from sfkd_jax.scenarios import Scenario
 from sfkd_jax.settings import arguments, choose, plain
 from sfkd_jax.types import Key, Params, Scalar, Trajectory
-
-WARM_UP = 10
-"""Control steps before timing starts."""
 
 
 class EpisodeSet(NamedTuple):
@@ -146,7 +143,6 @@ class SystemEvaluation:
         """Build the controller; of logs the box of e is that of the data set."""
         self._settings = settings
         self._plant = plant = build.build_vehicle(settings.vehicle)
-        self._times: tuple[float, float] | None = None
         box: Any = settings.environment.box
         # Their settings have none.
         if dataset is not None:
@@ -180,11 +176,8 @@ class SystemEvaluation:
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores, violation = self._scored(episodes, 0.0)
-        # Timed once: a control step takes equally long on every scenario.
-        if self._settings.evaluation.timed_steps and self._times is None:
-            self._times = self._act_ms(episodes)
         about = {"scenario": episodes.name}
-        row = evaluation.row(scores, self._columns | about, self._times, violation)
+        row = evaluation.row(scores, self._columns | about, violation)
         if forces := self._settings.evaluation.side_forces:
             row["disturbed"] = []
         for force in forces:
@@ -244,27 +237,6 @@ class SystemEvaluation:
             claims,
             length=self._settings.dataset.steps,
         )
-
-    def _act_ms(self, episodes: EpisodeSet) -> tuple[float, float]:
-        """Median and 99 % quantile of a compiled control step [ms]."""
-        scenario = jax.tree.map(lambda leaf: leaf[0], episodes.scenarios)
-        reference = reference_window(
-            scenario.path,
-            jnp.zeros(()),
-            scenario.speed,
-            dt=self._plant.dt,
-            horizon=self._settings.controller.horizon,
-        )
-        observed = (scenario.initial_state, scenario.envs[0], reference)
-        act = jax.jit(self.controller.act)
-        state, times = self.controller.init(episodes.keys[0]), []
-        for _ in range(WARM_UP + self._settings.evaluation.timed_steps):
-            start = time.perf_counter()
-            _, state, _ = jax.block_until_ready(act(self.params, state, *observed))
-            times.append(1e3 * (time.perf_counter() - start))
-        # The first steps compile the program and fill the caches.
-        times = times[WARM_UP:]
-        return float(np.median(times)), float(np.quantile(times, 0.99))
 
 
 def _columns(settings: Settings, name: str, system: System) -> Row:

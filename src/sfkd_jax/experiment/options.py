@@ -165,7 +165,6 @@ class EvaluationSettings:
         observation_noise: standard deviations of p_x, p_y [m], yaw [rad], v, v_y [m/s],
             yaw rate [rad/s], steering [rad]; by default of a satellite and inertial
             unit of survey grade.
-        timed_steps: control steps whose time is measured.
         side_forces: side forces that no model knows [N].
     """
 
@@ -174,7 +173,6 @@ class EvaluationSettings:
     seed: NonNegativeInt = 2026
     systems: Names = ("self", "nominal", "oracle")
     observation_noise: Numbers = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-    timed_steps: NonNegativeInt = 50
     side_forces: Numbers = ()
 
 
@@ -220,7 +218,6 @@ class DemoSettings:
 
     episodes: int
     episode_s: Seconds
-    timed_steps: NonNegativeInt
 
 
 @takes()
