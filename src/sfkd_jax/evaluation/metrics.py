@@ -192,8 +192,6 @@ METRICS: tuple[Metric, ...] = (
     Metric("rmse_m.p95", "95th percentile", "mm", "spread", millimetres),
     Metric("rmse_episodes_m", measure=_rmse, pool=np.ndarray.tolist,
            pool_seeds=lambda rows: [x for one in _of_trainings(rows) for x in one]),
-    Metric("rmse_trainings_m",
-           pool_seeds=lambda rows: [float(np.mean(x)) for x in _of_trainings(rows)]),
     Metric("max_deviation_m", "Largest deviation", "mm", "tracking",
            partial(millimetres, digits=0), _max_deviation,
            lambda values: float(np.max(values)),
