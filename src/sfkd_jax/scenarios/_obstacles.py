@@ -104,11 +104,6 @@ def in_view(course: Course, progress: Scalar) -> Obstacles:
 
 
 def car_clearance(obstacles: Obstacles, state: State) -> Scalar:
-    """Return how far a car is from the nearest circle [m], negative inside.
-
-    Args:
-        obstacles: circles, where they are now.
-        state: of the car, whose position is the middle of a box of `CAR`.
-    """
+    """Return how far a car, a box of `CAR`, is from the nearest obstacle now [m]."""
     direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
     return jnp.min(clearance(obstacles, state[:2], direction=direction, half=CAR))
