@@ -127,9 +127,13 @@ def distance(
     half: tuple[float, float],
 ) -> Float[Array, ...]:
     """Return the `clearance` from one obstacle, a row of `Obstacles`."""
-    x, y = (
-        a - b for a, b in zip(_place(obstacle.position, step), position, strict=True)
-    )
+    places, last = obstacle.position, obstacle.position.shape[0] - 1
+    # What stands still is not looked up for every sample.
+    step = jnp.clip(step if last else 0.0, 0.0, last)
+    index = jnp.floor(step).astype(int)
+    place, after = places[index].T, places[jnp.minimum(index + 1, last)].T
+    moved = place + (step - index) * (after - place)
+    x, y = (a - b for a, b in zip(moved, position, strict=True))
     (cos, sin), (length, width) = direction, obstacle.half
     their_cos, their_sin = jnp.cos(obstacle.yaw), jnp.sin(obstacle.yaw)
     parallel = jnp.abs(their_cos * cos + their_sin * sin)
@@ -149,17 +153,3 @@ def distance(
         ),
     )
     return jnp.where(obstacle.present, nearest - obstacle.radius, jnp.inf)
-
-
-def _place(
-    positions: Float[Array, "step 2"], step: Float[Array, ...] | float
-) -> Float[Array, "2 ..."]:
-    """Where an obstacle is after a number of steps."""
-    x, y = positions.T
-    last = positions.shape[0] - 1
-    if last == 0:
-        return jnp.stack([x[0], y[0]])
-    step = jnp.clip(step, 0.0, last)
-    index = jnp.minimum(jnp.floor(step).astype(int), last - 1)
-    share = step - index
-    return jnp.stack([z[index] + share * (z[index + 1] - z[index]) for z in (x, y)])

@@ -138,7 +138,7 @@ def lane_with(planner, **settings):
     search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
     search = planner(task.task(), **search, **settings)
     driver = control.in_lane(
-        inner=follower(), planner=search, manoeuvres=task, dt=DT, horizon=20
+        inner=follower(), planner=search, manoeuvres=task, horizon=20
     )
     return driver, jit(driver.act)
 

@@ -418,7 +418,6 @@ def build_in_lane(
         inner=inner,
         planner=search,
         manoeuvres=manoeuvres,
-        dt=plant.dt,
         horizon=horizon,
         friction=friction,
         lowest=certificate["boxes"]["env"][0][friction or 0],

@@ -15,7 +15,6 @@ from sfkd_jax.control.lanes._manoeuvre import Judged, Manoeuvres, Situation
 from sfkd_jax.control.lanes._reference import (
     BEHIND,
     Committed,
-    RoadAhead,
     road_ahead,
     speed_profile,
     window,
@@ -88,7 +87,6 @@ class InLane:
         inner: in the world; its `info` has the `corridor` of the reference.
         planner: of `Manoeuvres.task`, with horizon 1.
         manoeuvres: what is planned.
-        dt: sampling period [s].
         horizon: number of points of the reference that `inner` reads.
         samples: of the road that are planned, at the spacing of the path.
         period: number of steps from one search to the next.
@@ -101,7 +99,6 @@ class InLane:
     inner: Controller
     planner: Controller
     manoeuvres: Manoeuvres
-    dt: Positive
     horizon: AtLeastOne
     samples: AtLeastOne = 200
     period: AtLeastOne = 3
@@ -145,26 +142,20 @@ class InLane:
         """Take one control step."""
         task, weights = self.manoeuvres, state.planner.tuning.cost
         (lane, obstacles), clean = _finite(*scene)
-        state, road = self._located(state, observation, lane)
-        situation = self._situation(state, road, obstacles, env)
-        kept = task.judge(weights, situation, state.committed)
+        progress, situation = self._situation(state, observation, env, lane, obstacles)
+        kept = task.judge(weights, situation, situation.committed)
         free = ~jnp.any(kept.blocked) & clean
         # What was committed is judged at every step: what appears is seen at once.
         due = (state.wait <= 0) | ~free
         planner, committed = jax.lax.cond(
             due,
             lambda: self._search(state.planner, situation, kept, clean),
-            lambda: (state.planner, state.committed),
+            lambda: (state.planner, situation.committed),
         )
         judged = task.judge(weights, situation, committed)
-        place = state.progress / lane.path.spacing - committed.index
+        place, (dt, horizon) = situation.place, (task.dt, self.horizon)
         ahead = window(
-            lane.path,
-            committed,
-            judged.curve,
-            place,
-            dt=self.dt,
-            horizon=self.horizon,
+            lane.path, committed, judged.curve, place, dt=dt, horizon=horizon
         )
         control, inner, info = self.inner.act(
             params, state.inner, observation, env, ahead
@@ -181,68 +172,56 @@ class InLane:
             "admissible": (judged.violation <= 0.0) & clean,
             "stopping": ~judged.curve.reached[-1],
         }
-        wait = jnp.where(due, self.period, state.wait) - 1
-        after = state._replace(
-            inner=inner, planner=planner, committed=committed, wait=wait
+        after = LaneState(
+            inner=inner,
+            planner=planner,
+            committed=committed,
+            progress=progress,
+            wait=jnp.where(due, self.period, state.wait) - 1,
+            started=state.started | all_finite(observation),
         )
         return control, after, report
 
-    def _located(
-        self, state: LaneState, observation: State, lane: Lane
-    ) -> tuple[LaneState, RoadAhead]:
-        """Where the car is, and the road and the committed reference from there on."""
-        path, position = lane.path, observation[:2]
-        known = all_finite(observation[:4])
-        guess = state.progress + self.dt * jnp.sqrt(state.committed.square[BEHIND])
+    def _situation(
+        self,
+        state: LaneState,
+        observation: State,
+        env: Environment,
+        lane: Lane,
+        obstacles: Obstacles,
+    ) -> tuple[Scalar, Situation]:
+        """Where the car is along the path [m], and what references are judged by."""
+        path, position, kind = lane.path, observation[:2], self.manoeuvres.kind
+        index, square = state.committed.index, state.committed.square
+        known = all_finite(observation)
+        guess = state.progress + self.manoeuvres.dt * jnp.sqrt(square[BEHIND])
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
         # A road may cross itself: the nearest point counts if the car is nowhere else.
         fresh = known & ~(state.started & (away < LOST))
         nearest = jnp.argmin(jnp.sum((path.points[:, :2] - position) ** 2, axis=1))
         start = jnp.where(fresh, nearest * path.spacing, guess)
         progress, lateral = project(path, position, start)
-        index, count = state.committed.index, path.points.shape[0] - 1
-        if isinstance(path, Lap):
-            # Over the start of the lap all goes on; after it, one lap less is counted.
-            progress = (
-                progress + jnp.round((start - progress) / path.length) * path.length
-            )
-            laps = jnp.floor(progress / path.length)
-            progress = progress - laps * path.length
-            index = index - laps.astype(int) * count
         progress = jnp.where(known, progress, start)
+        if isinstance(path, Lap):
+            # Over the start of the lap the projection begins anew, and all else too.
+            behind = progress < start - 0.5 * path.length
+            index = index - jnp.where(behind, path.points.shape[0] - 1, 0)
         first = jnp.floor(progress / path.spacing).astype(int) - BEHIND
         first = jnp.where(fresh, first, jnp.maximum(first, index))
-        kind = self.manoeuvres.kind
         most = kind.acceleration, kind.deceleration
         road = road_ahead(lane, first, self.samples, most)
         # It begins where the car is, at its speed.
-        move = jnp.zeros_like(state.committed.move).at[0].set(lateral)
-        square = speed_profile(
-            road.wanted, jnp.maximum(observation[3], 0.0) ** 2, path.spacing, *most
-        )
-        begun = Committed(first, move, square)
+        move = jnp.zeros((3, self.samples)).at[0].set(lateral)
+        speed = jnp.maximum(observation[3], 0.0)
+        begun = speed_profile(road.wanted, speed**2, path.spacing, *most)
         held = state.committed._replace(index=index).at(first, road.wanted)
-        committed = jax.tree.map(partial(jnp.where, fresh), begun, held)
-        return state._replace(
-            committed=committed, progress=progress, started=state.started | known
-        ), road
-
-    def _situation(
-        self,
-        state: LaneState,
-        road: RoadAhead,
-        obstacles: Obstacles,
-        env: Environment,
-    ) -> Situation:
-        """What references are judged by in this step."""
-        friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
-        grip = (
-            self.share
-            * GRAVITY
-            * jnp.where(jnp.isfinite(friction), friction, self.lowest)
+        committed = jax.tree.map(
+            partial(jnp.where, fresh), Committed(first, move, begun), held
         )
-        place = state.progress / road.spacing - state.committed.index
-        return Situation(road, state.committed, obstacles, place, grip)
+        friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
+        friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
+        place, grip = progress / path.spacing - first, self.share * GRAVITY * friction
+        return progress, Situation(road, committed, obstacles, place, grip)
 
     def _search(
         self,
@@ -272,18 +251,14 @@ def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:
 
     Padding may hold anything.
     """
-    points, (count, *_) = lane.path.points.shape[0], obstacles.position.shape
-    sizes = [one.shape for one in (lane.left, lane.right, lane.speed)]
-    if sizes != [(points,)] * 3:
+    points, count = lane.path.points.shape[0], obstacles.position.shape[0]
+    sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
+    rows = {leaf.shape[0] for leaf in obstacles}
+    if sizes != {(points,)} or rows != {count} or obstacles.position.ndim != 3:
         raise ValueError(
-            f"left, right and speed of a lane must have shape ({points},), that of its "
-            f"path; got {sizes}"
-        )
-    sizes = [leaf.shape[:1] for leaf in obstacles]
-    if sizes != [(count,)] * len(obstacles) or obstacles.position.ndim != 3:
-        raise ValueError(
-            "obstacles must have position (obstacle, step, 2), yaw, half (obstacle, "
-            f"2), radius and present; got {[leaf.shape for leaf in obstacles]}"
+            f"left, right and speed of a lane have the shape ({points},) of its path, "
+            f"got {sizes}; obstacles are (obstacle, …), their position (obstacle, "
+            f"step, 2), got {[leaf.shape for leaf in obstacles]}"
         )
 
     def shown(leaf: Array) -> Array:

@@ -19,13 +19,7 @@ from sfkd_jax.control.lanes._reference import (
     curve,
     speed_profile,
 )
-from sfkd_jax.control.tasks._task import (
-    PlanningStart,
-    RolloutSetup,
-    StepIndex,
-    StepResult,
-    Task,
-)
+from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task
 from sfkd_jax.geometry import SMALLEST_SCALE
 from sfkd_jax.lanes import Obstacles, distance
 from sfkd_jax.paths import quintic
@@ -164,29 +158,15 @@ class Manoeuvres:
             constraint=lambda _, violation, *__: violation[None],
         )
 
-    def prepare(
-        self,
-        params: Params,
-        situation: Situation,
-        env: Any,
-        reference: Any,
-        start: PlanningStart,
-    ) -> RolloutSetup:
+    def prepare(self, params: Params, situation: Situation, *_: Any) -> RolloutSetup:
         """Return the situation; there is one step."""
-        del params, env, reference, start
+        del params
         return RolloutSetup(situation, jnp.zeros(()), jnp.zeros(1))
 
     def step(
-        self,
-        weights: Any,
-        situation: Situation,
-        sample: Scalar,
-        row: Control,
-        target: Any,
-        at: StepIndex,
+        self, weights: Any, situation: Situation, sample: Scalar, row: Control, *_: Any
     ) -> StepResult:
-        """Return the cost of one row and its violation in place of a state."""
-        del target, at
+        """Return the cost of one row, and its violation in place of a state."""
         judged = self.judge(weights, situation, self.reference(situation, row))
         return StepResult(sample, judged.cost, row, row, judged.violation)
 
