@@ -1,0 +1,295 @@
+"""Round obstacles that are seen late: placed by chance, by an enemy, and pedestrians.
+
+    python -m benchmarks.lane [--cars dynamic --systems lane --rows random --runs 200]
+
+Systems on the same roads, true cars, S3's schedule and sensor noise: the policy in its
+lane; MPPI whose plans must keep clear of what is in view, with the car itself as its
+model (oracle) or the model of the shipped policy of that car (learned); the same in the
+guard along the road. Writes benchmarks/lane.json, one line a row; what is there is not
+measured again.
+"""
+
+import argparse
+import json
+import time
+from itertools import product
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sfkd_jax
+from benchmarks.recovery import CARS, HORIZON, NOISE, PERIOD, SHIPPED, shown
+from sfkd_jax import control, evaluation, models, policy, scenarios
+from sfkd_jax.lanes import Obstacles, clearance
+from sfkd_jax.types import Controller
+
+SPEED, STEPS, IN_VIEW = 10.0, 600, 4
+"""Wanted [m/s]; of a run; obstacles that are shown at once."""
+MARGIN, EDGE = 0.3, 5.25
+"""That MPPI keeps from obstacles; from the middle of the road to its edges [m]."""
+APPEAR, SUDDEN = 40.0, 15.0
+"""Distance at which an enemy's obstacle is seen at the latest, and a pedestrian [m]."""
+TOLD = ("corridor", "clearance", "gap")
+GUARDED = " in the guard"
+SYSTEMS = ("lane", "oracle", "learned", "oracle" + GUARDED, "learned" + GUARDED)
+
+
+class Car:
+    """A shipped policy, its true car, and the systems that drive it."""
+
+    def __init__(self, name, samples):
+        directory, self.name = SHIPPED / f"{name}_path", name
+        planner = sfkd_jax.load(directory).settings["controller"]
+        mppi = planner["mppi"] | {"num_samples": samples}
+        self.policy = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
+        self.plant, self.samples = self.policy.vehicle, samples
+
+    def system(self, name):
+        """A controller of scenes, whose params are those of the policy."""
+        if name == "lane":
+            length, width = (2.0 * half for half in scenarios.CAR)
+            return self.policy.in_lane(car=(length, width))
+        model, params = models.physics(self.plant.step), {}
+        if not name.startswith("oracle"):
+            known = policy.restore(SHIPPED / self.name)
+            model, params = known.model, known.params
+        task = control.path_tracking(
+            model,
+            control.tracking_cost(dt=PERIOD),
+            control.path_feedback(wheelbase=self.plant.wheelbase),
+            dt=PERIOD,
+            control_low=self.plant.control_low,
+            control_high=self.plant.control_high,
+        )
+        nothing = jnp.zeros((IN_VIEW, 2)), jnp.zeros(IN_VIEW), jnp.zeros(IN_VIEW)
+        clear = control.constrained(task, too_near, nothing)
+        planner = control.mppi(clear, num_samples=self.samples, horizon=HORIZON)
+        free = Controller(planner.init, lambda _, *rest: planner.act(params, *rest))
+        return on_road(self.policy.guard(free) if name.endswith(GUARDED) else free)
+
+    def program(self, name):
+        """(scenarios) -> what is recorded of their episodes, (run, time)."""
+        system = self.system(name)
+        record = {
+            one: lambda info, one=one: 1.0 * info.get(one, jnp.nan) for one in TOLD
+        }
+
+        def run(scenario, key):
+            made = evaluation.simulate(
+                self.plant.step,
+                system,
+                self.policy.params,
+                scenario,
+                key,
+                dt=PERIOD,
+                horizon=HORIZON,
+                observation_noise=NOISE,
+                record=record,
+            )
+            # From the middle of the road, also where another reference is followed.
+            foot = jax.vmap(scenarios.point_at, (None, 0))(scenario.path, made.progress)
+            away, yaw = made.states[1:, :2] - foot[:, :2], foot[:, 2]
+            middle = away[:, 1] * jnp.cos(yaw) - away[:, 0] * jnp.sin(yaw)
+            told = {one: made.signals[one] for one in TOLD}
+            told |= {"lateral": made.lateral, "along": made.progress}
+            return told | {"middle": middle, "speed": made.states[1:, 3]}
+
+        many = jax.jit(jax.vmap(run))
+        # The same noise for every system.
+        return lambda roads: jax.tree.map(
+            np.asarray,
+            many(roads, jax.random.split(jax.random.key(36), len(roads.speed))),
+        )
+
+
+def too_near(data, state, action, target, at):
+    """How much nearer than `MARGIN` a planned state is to the circles in view [m]."""
+    position, radius, present = data
+    still, point = jnp.zeros(IN_VIEW), jnp.zeros((IN_VIEW, 2))
+    seen = Obstacles(position[:, None], still, point, radius, present > 0.5)
+    direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
+    apart = clearance(seen, state[:2], direction=direction, half=scenarios.CAR)
+    return jnp.maximum(MARGIN - apart, -1e3)
+
+
+def on_road(controller):
+    """A controller of references, given the middle of the road and what is in view."""
+
+    def act(params, memory, seen, env, scene):
+        (lane, shown), (along, inner) = scene, memory
+        along, _ = scenarios.project(lane.path, seen[:2], along + SPEED * PERIOD)
+        ahead = scenarios.reference_window(
+            lane.path, along, lane.speed[0], dt=PERIOD, horizon=HORIZON
+        )
+        data = shown.position[:, 0], shown.radius, shown.present.astype(float)
+        inner = control.tuned(inner, constraints=data)
+        action, inner, info = controller.act(params, inner, seen, env, ahead)
+        return action, (along, inner), info
+
+    return Controller(lambda key: (jnp.zeros(()), controller.init(key)), act)
+
+
+def courses(car, count, seed):
+    """Roads of the scenario."""
+    family = scenarios.scenario(
+        name="obstacles",
+        duration=STEPS * PERIOD,
+        state_size=len(car.plant.state_names),
+        dt=PERIOD,
+        speed=SPEED,
+        peak_curvature=0.004,
+        wavelengths=(100.0, 300.0),
+    )
+    return jax.jit(jax.vmap(family))(jax.random.split(jax.random.key(seed), count))
+
+
+def placed(roads, along, aside, view, *, radius, until):
+    """The same roads with other obstacles, (run, obstacle); none after `until` [m]."""
+    along, aside, view = (
+        jnp.asarray(np.broadcast_to(one, np.shape(along)), jnp.float32)
+        for one in (along, aside, view)
+    )
+    place = jax.jit(jax.vmap(scenarios.beside))(roads.path, along, aside)
+    every = roads.course.obstacles._replace(
+        position=place[:, :, None],
+        radius=jnp.full(along.shape, radius),
+        present=along < until,
+    )
+    course = roads.course._replace(obstacles=every, along=along, view=view)
+    return roads._replace(course=course)
+
+
+def counted(car, made):
+    """What a row says about its runs."""
+    gap, far, claim = made["gap"], np.abs(made["lateral"]), made["corridor"]
+    side, nearest = np.abs(made["middle"]) + scenarios.CAR[1], gap.min(axis=1)
+    return {
+        "runs": len(gap),
+        "collisions": int((nearest < 0.0).sum()),
+        "left_the_lane": int((side > EDGE).any(axis=1).sum()),
+        "clearance_below_claim": int((gap < made["clearance"]).sum()),
+        "beyond_corridor": int((far > claim).sum()),
+        "steps": gap.size,
+        "in_domain": shown(np.isfinite(claim).mean(), 4),
+        "worst_lateral_m": shown(np.where(np.isfinite(claim), far, 0.0).max()),
+        "corridor_m": shown(car.policy.certificate["corridor"]["corridor_m"]),
+        "smallest_clearance_m": shown(nearest.min()),
+        "mean_speed": shown(made["speed"].mean(), 2),
+        "progress_m": shown(made["along"][:, -1].mean(), 1),
+        "stand": int((made["speed"][:, -1] < 0.1).sum()),
+    }
+
+
+def random_rows(car, system, drive, given):
+    """Courses of the scenario."""
+    yield "random courses", counted(car, drive(courses(car, given.runs, 35)))
+
+
+def pedestrian_rows(car, system, drive, given):
+    """Somebody steps out onto the road and stands there, once in a run."""
+    draw, roads = np.random.default_rng(37), courses(car, given.runs, 37)
+    half, shape = given.runs // 2, roads.course.along.shape
+    along = 90.0 + 200.0 * np.arange(shape[1]) + draw.uniform(0.0, 10.0, (shape[0], 1))
+    aside = draw.uniform(-1.5, 1.5, shape)
+    envs = np.zeros(roads.envs.shape, np.float32)
+    envs[:half, :, 0], envs[half:, :, 0] = 0.9, 0.3
+    roads = roads._replace(envs=jnp.asarray(envs), observed_envs=jnp.asarray(envs))
+    made = drive(placed(roads, along, aside, SUDDEN, radius=0.3, until=150.0))
+    for friction, mine in ((0.9, slice(half)), (0.3, slice(half, None))):
+        part = jax.tree.map(lambda leaf, mine=mine: leaf[mine], made)
+        yield f"pedestrian, friction {friction}", counted(car, part)
+
+
+def enemy_rows(car, system, drive, given):
+    """Places, and when they are seen first, by a cross-entropy search."""
+    draw, base = np.random.default_rng(39), courses(car, given.runs, 39)
+    mean, spread, found, hits = np.zeros(3 * base.course.along.shape[1]), 1.0, [], []
+
+    def roads(genes, latest):
+        gaps, sides, sight = np.split(np.clip(genes, -1.0, 1.0), 3, axis=1)
+        along = 45.0 + np.cumsum(40.0 + 20.0 * gaps, axis=1)
+        view = latest + 10.0 * (sight + 1.0)
+        return placed(base, along, 3.0 * sides, view, radius=0.8, until=640.0)
+
+    for _ in range(given.generations):
+        genes = mean + spread * draw.normal(size=(given.runs, len(mean)))
+        made = drive(roads(genes, APPEAR))
+        near = made["gap"].min(axis=1)
+        found.append(counted(car, made))
+        # Whoever sees all at once and passes had a reference that was admissible.
+        if (near < 0.0).any():
+            known = drive(roads(genes, 500.0))["gap"].min(axis=1)
+            hits.append(int(((near < 0.0) & (known >= 0.0)).sum()))
+        # Of those that come as near, the slower run is worse.
+        order = np.argsort(near + 1e-4 * made["along"][:, -1])
+        best = genes[order[: max(2, given.runs // 10)]]
+        mean, spread = best.mean(axis=0), np.maximum(best.std(axis=0), 0.1)
+    whole = {
+        k: sum(one[k] for one in found) for k, v in found[0].items() if type(v) is int
+    }
+    least = min(one["smallest_clearance_m"] for one in found)
+    yield (
+        "enemy",
+        found[-1] | whole | {"smallest_clearance_m": least, "avoidable": sum(hits)},
+    )
+
+
+def cost_rows(car, system, drive, given):
+    """Control steps one after the other, on this machine."""
+    controller, road = car.system(system), courses(car, 1, 41)
+    road = jax.tree.map(lambda leaf: leaf[0], road)
+    scene = road.course.lane, scenarios.in_view(road.course, jnp.asarray(30.0))
+    act, memory, times = jax.jit(controller.act), controller.init(jax.random.key(1)), []
+    seen = car.policy.params, road.initial_state, road.envs[0], scene
+    for _ in range(110):
+        began = time.perf_counter()
+        _, memory, _ = jax.block_until_ready(act(seen[0], memory, *seen[1:]))
+        times.append(1e3 * (time.perf_counter() - began))
+    median, slow = np.median(times[10:]), np.quantile(times[10:], 0.99)
+    yield "a call", {"median_ms": shown(median, 2), "p99_ms": shown(slow, 2)}
+
+
+ROWS = {
+    "random": random_rows,
+    "pedestrian": pedestrian_rows,
+    "enemy": enemy_rows,
+    "cost": cost_rows,
+}
+
+
+def main():
+    """Drive, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cars", nargs="*", choices=CARS, default=CARS)
+    parser.add_argument("--systems", nargs="*", choices=SYSTEMS, default=SYSTEMS)
+    parser.add_argument("--rows", nargs="*", choices=ROWS, default=[*ROWS])
+    parser.add_argument("--runs", type=int, default=200, help="at once")
+    parser.add_argument("--generations", type=int, default=4)
+    parser.add_argument("--samples", type=int, default=1500)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
+    given, began = parser.parse_args(), time.perf_counter()
+    rows = json.loads(given.out.read_text("utf-8")) if given.out.exists() else []
+    about = {"samples": given.samples, "device": jax.devices()[0].device_kind}
+    done = {(row["car"], row["system"], row["group"]) for row in rows}
+    for name, system in product(given.cars, given.systems):
+        missing = [one for one in given.rows if (name, system, one) not in done]
+        if not missing:
+            continue
+        car = Car(name, given.samples)
+        drive = car.program(system)
+        for group in missing:
+            for label, found in ROWS[group](car, system, drive, given):
+                named = {"car": name, "system": system, "group": group, "row": label}
+                rows.append(named | found | about)
+                print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)
+            # After every group: a run that is cut off goes on where it was.
+            lines = [json.dumps(row, separators=(",", ":")) for row in rows]
+            given.out.write_text("[\n" + ",\n".join(lines) + "\n]\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
