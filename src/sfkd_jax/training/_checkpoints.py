@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as managers
 
-from sfkd_jax.store import one_line, print_message
+from sfkd_jax.store import one_line
 
 
 class Checkpoints:
@@ -70,26 +70,19 @@ class Checkpoints:
         return self._manager.best_step()
 
     def resume(self, like: Any) -> Any:
-        """Return the newest readable state, or `like` if there is no state.
-
-        A damaged one is reported on stderr; an OSError says that all of them are.
-        """
-        # From the newest on: a damaged state costs the steps since the one before.
-        steps = sorted(self._manager.all_steps(), reverse=True)
-        for step in steps:
-            # Every array that orbax had not read yet prints a traceback of its own.
-            with redirect_stderr(StringIO()):
-                try:
-                    return self.restore(step, like)
-                except Exception as reason:  # orbax raises any error of its storage
-                    line = one_line(str(reason) or type(reason).__name__)
-            print_message(f"checkpoint {step} cannot be read ({line})")
-        if steps:
-            raise OSError(
-                f"no checkpoint in {self._manager.directory} can be read; "
-                "remove it to start again"
-            )
-        return like
+        """Return the newest state, or `like` if there is no state."""
+        if (step := self.latest_step()) is None:
+            return like
+        # Every array that orbax had not read yet prints a traceback of its own.
+        with redirect_stderr(StringIO()):
+            try:
+                return self.restore(step, like)
+            except Exception as reason:  # orbax raises any error of its storage
+                line = one_line(str(reason) or type(reason).__name__)
+                raise OSError(
+                    f"{self._manager.directory}/{step} cannot be read ({line}); "
+                    "remove it to go on from the checkpoint before"
+                ) from reason
 
     def restore(self, step: int, like: Any) -> Any:
         """Return the state saved at `step`, with the structure and types of `like`."""
