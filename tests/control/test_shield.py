@@ -514,6 +514,15 @@ def test_what_one_step_cannot_explain_is_not_followed(name):
         assert np.asarray(info["measured"])[lost].tolist() == [[False, True, True]] * 18
 
 
+def test_a_model_that_nothing_is_known_of_overrules_no_measurement():
+    def wrong(env, latent, inputs):
+        return TOY.step(env, latent, inputs) + jnp.asarray([0.0, 1.0, 0.0])
+
+    controller = gated(scripted(), model=TOY._replace(step=wrong))
+    _, _, info = drive(controller, jnp.zeros((50, 2)), np.zeros((50, 3)))
+    assert np.all(info["measured"])
+
+
 def test_a_delay_is_recognised_and_made_up_for_far_beyond_the_patience():
     """Under a push that would drive a car without measurements off its path."""
     push = np.tile(0.5 * DISTURBANCE * [0.0, 1.0, 0.0], (160, 1))

@@ -135,8 +135,9 @@ class Gate:
     the vehicle was up to 1.2 s ago, is late, and corrects the estimates since then.
     After `patience` a finite measurement is believed, whatever it says, and the
     certificate is not claimed for a `trial`; without one, or 6 s of late ones, the
-    reference speed falls, and the vehicle stops. Outside the conditions ξ⁻ is a point
-    that keeps its heading and speed, and the limits are what a vehicle can reach.
+    reference speed falls, and the vehicle stops. Outside the conditions, and without a
+    box of ξ, ξ⁻ is a point that keeps its heading and speed, and the limits are what a
+    vehicle can reach.
 
     An environment or reference that is not finite is replaced by the last one, and by
     the middle of the box of e before the first; the road moves on with every step.
@@ -423,14 +424,18 @@ class Gate:
         control, road, env = applied
         model = self.model
         nearest = self.conditions.nearest(env)
-        fiber = model.fiber(fold(model, params), nearest)
         nu = control - self.law(xi, road[0], road[1], nearest)
-        ahead = expected_coordinates(model, fiber, xi, nu, road)
-        inside = self.conditions.hold(xi, road) & all_finite(ahead)
-        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
         # Beyond what data and planners add to the law, the model was not learned.
         usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
-        return jnp.where(inside, ahead, xi.at[LATERAL].add(sideways)), inside, usual
+        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
+        onward = xi.at[LATERAL].add(sideways)
+        if self.conditions.state is None:
+            # A model that nothing is known of must not overrule a measurement.
+            return onward, jnp.asarray(False), usual
+        fiber = model.fiber(fold(model, params), nearest)
+        ahead = expected_coordinates(model, fiber, xi, nu, road)
+        inside = self.conditions.hold(xi, road) & all_finite(ahead)
+        return jnp.where(inside, ahead, onward), inside, usual
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
