@@ -13,7 +13,6 @@ from sfkd_jax.geometry import (
     CURVATURE,
     HEADING,
     LATERAL,
-    PATH_SPEED,
     REFERENCE_SPEED,
 )
 from sfkd_jax.rollout import with_offset
@@ -259,7 +258,7 @@ def build_controller(
         options = arguments(searches.adaptation, control.Adaptation)
         adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
         along = adaptation.controller()
-    conditions = _conditions(law, certificate, env_low, env_high)
+    conditions = _conditions(certificate, env_low, env_high)
     test = None if estimates else _test(certificate)
     controller = _gated(along, searches, model, plant, law, conditions, test, estimates)
     if planner or not adaptive:
@@ -349,7 +348,7 @@ def in_corridor(
         start_error=ALLOWANCE * (sensors[LATERAL] + ratio * sensors[HEADING]),
         decay=certificate["alpha"],
         control=(plant.control_low, plant.control_high),
-        conditions=_conditions(law, certificate),
+        conditions=_conditions(certificate),
         dt=plant.dt,
         rear=_rear(law),
     ).controller()
@@ -400,7 +399,7 @@ def build_in_lane(
         friction: entry of e that is the friction; None if none is.
     """
     corridor, road = certificate["corridor"], certificate["boxes"]["control"]
-    under, state = corridor["conditions"], _conditions(law, certificate).state
+    under, state = corridor["conditions"], _conditions(certificate).state
     # The sharpest slope of the sinusoids that the roads of the class are made of.
     turning = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
     kind = control.Class(
@@ -432,18 +431,16 @@ def _sensors(corridor: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _conditions(
-    law: control.PathLaw,
     certificate: Mapping[str, Any] | None,
     env_low: Corner = None,
     env_high: Corner = None,
 ) -> control.Conditions:
-    """Where the model predicts: the box of a certificate, or that of the law.
+    """Where the model predicts, as its certificate says.
 
     The box of e_y contains the corridor, since the claim holds there, whether or not
     the data reach that far. The other boxes are those of the data, somewhat enlarged:
     the runs on which a corridor is calibrated leave them as well.
     """
-    size = law.gain.shape[-1]
     if certificate:
         corridor, boxes = certificate.get("corridor"), certificate["boxes"]
         low, high = (np.asarray(side, float) for side in boxes["state"])
@@ -461,12 +458,9 @@ def _conditions(
         return control.Conditions(
             env=_box(*env), state=_box(low, high), road=_box(*road)
         )
-    wide = np.full(size, np.inf)
-    wide[[LATERAL, HEADING]] = control.NEAR[:PATH_SPEED]
-    low, high = -wide, wide
-    low[PATH_SPEED], high[PATH_SPEED] = law.low[1] - 1.0, law.high[1] + 1.0
+    # Without a certificate nothing says where a model predicts.
     env = None if env_low is None or env_high is None else _box(env_low, env_high)
-    return control.Conditions(env=env, state=_box(low, high))
+    return control.Conditions(env=env)
 
 
 def _box(low: Any, high: Any) -> control.Box:
