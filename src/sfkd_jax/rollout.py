@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import (
@@ -156,28 +156,45 @@ def rollout(
     return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
 
 
-def sliding_windows(trajectory: Trajectory, *, horizon: int, stride: int) -> Trajectory:
-    """Return the windows of one trajectory along a new leading axis.
+def windows(
+    trajectories: Trajectory,
+    rows: Int[Array, " batch"],
+    starts: Int[Array, " batch"],
+    *,
+    length: int,
+) -> Trajectory:
+    """Cut one window of `length` steps per row, from its start."""
+    if length > (steps := trajectories.controls.shape[1]):
+        # A slice out of range would be shifted, not refused.
+        raise ValueError(
+            f"windows of {length} steps do not fit trajectories of {steps} steps"
+        )
+    sizes = Trajectory(length + 1, length, length)  # pyright: ignore
+
+    def cut(row: Int[Array, ""], start: Int[Array, ""]) -> Trajectory:
+        return jax.tree.map(
+            lambda leaf, size: jax.lax.dynamic_slice_in_dim(leaf[row], start, size),
+            trajectories,
+            sizes,
+        )
+
+    return jax.vmap(cut)(rows, starts)
+
+
+def sliding_windows(
+    trajectories: Trajectory, *, length: int, stride: int
+) -> Trajectory:
+    """Cut all windows of a batch, one trajectory after another.
 
     Args:
-        trajectory: one, states (T + 1, state).
-        horizon: steps of a window.
+        trajectories: states (batch, T + 1, state).
+        length: steps of a window.
         stride: steps between the starts of two windows.
-
-    Raises:
-        ValueError: the horizon does not fit the trajectory.
     """
-    # Controls count steps; there is one state more.
-    steps = trajectory.controls.shape[0]
-    if horizon > steps:
-        raise ValueError(
-            f"a horizon of {horizon} steps does not fit trajectories of {steps} steps"
-        )
-    starts = jnp.arange(0, steps - horizon + 1, stride)
-    # One state more than steps: a window ends with the state after its last control.
-    states = trajectory.states[starts[:, None] + jnp.arange(horizon + 1)]
-    inside = starts[:, None] + jnp.arange(horizon)
-    return Trajectory(states, trajectory.controls[inside], trajectory.envs[inside])
+    count, steps = trajectories.controls.shape[:2]
+    starts = jnp.arange(0, steps - length + 1, stride)
+    rows = jnp.repeat(jnp.arange(count), starts.size)
+    return windows(trajectories, rows, jnp.tile(starts, count), length=length)
 
 
 def state_errors(

@@ -10,6 +10,7 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, segments
 
 from sfkd_jax import data as datasets
 from sfkd_jax.data._dataset import assign_parts
+from sfkd_jax.rollout import windows
 from sfkd_jax.types import Trajectory
 
 LOW, HIGH = jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH)
@@ -80,7 +81,7 @@ def test_an_environment_outside_its_box_is_refused(value):
 def test_windows_are_slices():
     data = segments()
     rows, starts = np.asarray([5, 0, 119]), np.asarray([0, 7, 17])
-    cut = datasets.windows(data, jnp.asarray(rows), jnp.asarray(starts), length=8)
+    cut = windows(data, jnp.asarray(rows), jnp.asarray(starts), length=8)
     for leaf, whole, size in zip(cut, data, (9, 8, 8), strict=True):
         for k, (row, start) in enumerate(zip(rows, starts, strict=True)):
             np.testing.assert_array_equal(leaf[k], whole[row, start : start + size])

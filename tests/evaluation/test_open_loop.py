@@ -29,7 +29,7 @@ def test_the_true_plant_has_no_error_and_a_wrong_model_more_the_further_it_looks
     assert np.all(result[:, :3] > 0)
     assert np.all(np.diff(result[:, 1]) > 0)
     assert result[-1, 1] > 5 * result[0, 1]
-    with pytest.raises(ValueError, match="13 steps does not fit trajectories of 12"):
+    with pytest.raises(ValueError, match="13 steps do not fit trajectories of 12"):
         errors_of("oracle", driven(), 13)
 
 

@@ -5,11 +5,10 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import at, driven, jit
+from helpers import jit
 
 from sfkd_jax import models
 from sfkd_jax.evaluation import ClaimedBounds, violations
-from sfkd_jax.rollout import sliding_windows
 from sfkd_jax.types import Trajectory
 
 WIDE = 99.0
@@ -35,17 +34,6 @@ def rates(model, data, *, radii=(WIDE, WIDE, WIDE), latent=WIDE, d_bar=WIDE, len
     )
     found = jit(partial(violations, model, length=length))({}, data, claims)
     return float(found["v0"]), float(found["v1"])
-
-
-def test_windows_are_the_stretches_that_start_at_every_stride():
-    one = at(driven(), 0)
-    cut = sliding_windows(one, horizon=5, stride=3)
-    assert len(cut.states) == 3  # from 0, 3, 6; the one from 9 does not fit 12 steps
-    for index, start in enumerate((0, 3, 6)):
-        stop = start + 5
-        np.testing.assert_array_equal(cut.states[index], one.states[start : stop + 1])
-        np.testing.assert_array_equal(cut.controls[index], one.controls[start:stop])
-        np.testing.assert_array_equal(cut.envs[index], one.envs[start:stop])
 
 
 @pytest.mark.parametrize(

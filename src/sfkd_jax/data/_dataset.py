@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from sfkd_jax.data._logs import Log
 from sfkd_jax.geometry import PathFeedback, between, is_valid, path_state, wrap_angle
+from sfkd_jax.rollout import windows
 from sfkd_jax.scenarios import Path, point_at, project
 from sfkd_jax.types import BODY, POSE, Key, Scalar, Space, State, Trajectory
 
@@ -284,31 +285,6 @@ def _range(
 def _away_from_zero(scale: Float[Array, " n"]) -> Float[Array, " n"]:
     """A channel that never moves gets scale 1."""
     return jnp.where(scale > 1e-6, scale, 1.0)
-
-
-def windows(
-    trajectories: Trajectory,
-    rows: Int[Array, " batch"],
-    starts: Int[Array, " batch"],
-    *,
-    length: int,
-) -> Trajectory:
-    """Cut one window of `length` steps per row, from its start."""
-    if length > (steps := trajectories.controls.shape[1]):
-        # A slice out of range would be shifted, not refused.
-        raise ValueError(
-            f"windows of {length} steps do not fit trajectories of {steps} steps"
-        )
-    sizes = Trajectory(length + 1, length, length)  # pyright: ignore
-
-    def cut(row: Int[Array, ""], start: Int[Array, ""]) -> Trajectory:
-        return jax.tree.map(
-            lambda leaf, size: jax.lax.dynamic_slice_in_dim(leaf[row], start, size),
-            trajectories,
-            sizes,
-        )
-
-    return jax.vmap(cut)(rows, starts)
 
 
 def random_windows(

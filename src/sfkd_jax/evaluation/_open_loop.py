@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -44,10 +42,7 @@ def open_loop(
         trajectories: held out from training.
         horizon: steps.
     """
-    cut = jax.vmap(partial(sliding_windows, horizon=horizon, stride=horizon))
-    windows = jax.tree.map(
-        lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(trajectories)
-    )
+    windows = sliding_windows(trajectories, length=horizon, stride=horizon)
 
     def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
         predicted, true = rollout(model, params, window)[0], window.states[1:]

@@ -62,13 +62,13 @@ def violations(
         which the theorem excludes; NaN without such steps. `v1`: the part of the
         segments that leave the tube anywhere.
     """
-    cut = jax.vmap(partial(sliding_windows, horizon=length, stride=length))
     # V1 counts segments, because calibration did.
-    segments = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), cut(runs))
+    segments = sliding_windows(runs, length=length, stride=length)
 
     def one(segment: Trajectory) -> tuple[Array, ...]:
+        alone = jax.tree.map(lambda leaf: leaf[None], segment)
         horizon = len(claims.latent)
-        windows = sliding_windows(segment, horizon=horizon, stride=STRIDE)
+        windows = sliding_windows(alone, length=horizon, stride=STRIDE)
         each = jax.vmap(partial(_along_window, model, params, claims))
         inside, beyond, applies = each(windows)
         return jnp.all(inside), jnp.sum(beyond), jnp.sum(applies)
