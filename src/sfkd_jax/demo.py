@@ -40,7 +40,7 @@ def run(settings: Settings) -> dict[str, Any]:
     systems = {trained.settings["model"]["system"]: own}
     systems |= {name: references[name] for name in ("nominal", "oracle")}
     with store.locked(home):
-        found = evaluating.drive(settings, systems, episodes, None)
+        found = evaluating.drive(settings, systems, episodes)
         seconds = time.perf_counter() - began
         results = runs.write_results(home, plain(settings), found, seconds)
         # The last ones: those of an earlier demo with other settings come before.

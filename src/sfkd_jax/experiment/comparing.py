@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import command, data, evaluating, runs, stages
+from sfkd_jax.experiment import command, evaluating, runs, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
 from sfkd_jax.settings import plain, replace
@@ -307,8 +307,7 @@ class Comparison:
         if "self" in settings.evaluation.systems:
             stages.ensure_certificate(settings)
         ((name, system),) = evaluating.load_systems(settings).items()
-        dataset, _ = data.ensure_dataset(settings)
-        return evaluating.SystemEvaluation(settings, name, system, dataset)
+        return evaluating.SystemEvaluation(settings, name, system)
 
     def _make_episodes(self, settings: Settings) -> EpisodeSet:
         """The episodes of a cell; rows that are compared share them."""

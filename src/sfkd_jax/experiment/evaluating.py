@@ -16,7 +16,7 @@ import numpy as np
 
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
-from sfkd_jax.data import Dataset, to_path
+from sfkd_jax.data import to_path
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
@@ -137,15 +137,14 @@ def _policy_system(settings: Settings) -> System:
 class SystemEvaluation:
     """One system, compiled once for all sets of episodes of one length."""
 
-    def __init__(
-        self, settings: Settings, name: str, system: System, dataset: Dataset | None
-    ) -> None:
-        """Build the controller; of logs the box of e is that of the data set."""
+    def __init__(self, settings: Settings, name: str, system: System) -> None:
+        """Build the controller."""
         self._settings = settings
         self._plant = plant = build.build_vehicle(settings.vehicle)
         box: Any = settings.environment.box
-        # Their settings have none.
-        if dataset is not None:
+        if settings.logs:
+            # Measured: their settings have none.
+            dataset, _ = data.ensure_dataset(settings)
             box = dict(zip(box, (dataset.env_low, dataset.env_high), strict=True))
         self.controller = build.build_controller(
             settings.controller,
@@ -287,25 +286,21 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     episodes = make_episodes(settings)
     runs.read_results(settings.run_dir)
     compared = load_systems(settings)
-    dataset, _ = data.ensure_dataset(settings)
-    found = drive(settings, compared, episodes, dataset)
+    found = drive(settings, compared, episodes)
     seconds = time.perf_counter() - began
     config = plain(settings) | ({"command": command} if command else {})
     return runs.write_results(settings.run_dir, config, found, seconds)
 
 
 def drive(
-    settings: Settings,
-    systems: Mapping[str, System],
-    episodes: EpisodeSet,
-    dataset: Dataset | None,
+    settings: Settings, systems: Mapping[str, System], episodes: EpisodeSet
 ) -> list[SystemResult]:
     """Simulate, score and compare systems on the same episodes, with messages."""
     protocol, found = settings.evaluation, list[SystemResult]()
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     for name, system in systems.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
-        result = SystemEvaluation(settings, name, system, dataset)(episodes)
+        result = SystemEvaluation(settings, name, system)(episodes)
         found.append(result)
         error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
