@@ -155,7 +155,7 @@ def _whole(values: np.ndarray) -> Any:
 
 def _of_rows(name: str, combine: Callable[[list[Any]], Any], rows: list[Row]) -> Any:
     """The same over trainings; None where one has no value."""
-    values = [row[name] for row in rows]
+    values = [row.get(name) for row in rows]
     return None if None in values else combine(values)
 
 
