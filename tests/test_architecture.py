@@ -77,7 +77,7 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 25_440, "tests": 15_390, "benchmarks, experiments": 2_300}
+LINES = {"src": 25_420, "tests": 15_380, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
 FILES_IN_SRC = 133
 
