@@ -96,12 +96,19 @@ class Car:
             told |= {"lateral": made.lateral, "along": made.progress}
             return told | {"middle": middle, "speed": made.states[1:, 3]}
 
-        many = jax.jit(jax.vmap(run))
-        # The same noise for every system.
-        return lambda roads: jax.tree.map(
-            np.asarray,
-            many(roads, jax.random.split(jax.random.key(36), len(roads.speed))),
-        )
+        def drive(roads):
+            # The same noise for every system.
+            keys = jax.random.split(jax.random.key(36), len(roads.speed))
+            if jax.default_backend() != "cpu":
+                return jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(roads, keys))
+            every = [
+                alone(*jax.tree.map(lambda leaf, i=i: leaf[i], (roads, keys)))
+                for i in range(len(keys))
+            ]
+            return jax.tree.map(lambda *leaves: np.stack(leaves), *every)
+
+        alone = jax.jit(run)
+        return drive
 
 
 def too_near(data, state, action, target, at):

@@ -20,11 +20,11 @@ from sfkd_jax.data import to_path
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import check_step
+from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, unfold
-from sfkd_jax.scenarios import Scenario
+from sfkd_jax.scenarios import CAR, ROADS, Scenario
 from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.types import Key, Params, Scalar, Trajectory
+from sfkd_jax.types import Controller, Key, Params, Scalar, Trajectory
 
 
 class EpisodeSet(NamedTuple):
@@ -155,6 +155,8 @@ class SystemEvaluation:
             env_source=system.env_source,
             law=system.law,
         )
+        if has_course(settings):
+            self.controller = _in_lane(name, system, plant, settings, self.controller)
         # Folded once here; otherwise every control step would fold again.
         self.params = jax.jit(partial(fold, system.model))(system.params)
         self._system = system._replace(params=self.params)
@@ -238,6 +240,32 @@ class SystemEvaluation:
         )
 
 
+def has_course(settings: Settings) -> bool:
+    """Whether there are obstacles on the road, and scenes in place of references."""
+    return ROADS[settings.scenario.name].course is not None
+
+
+def _in_lane(
+    name: str, system: System, plant: Vehicle, settings: Settings, inner: Controller
+) -> Controller:
+    """Return a controller of scenes around one of references."""
+    if system.law is None or not (system.certificate or {}).get("corridor"):
+        raise ValueError(
+            f"scenario={settings.scenario.name} needs systems with a certified "
+            f"corridor, and {name} has none: evaluation.systems=[self]"
+        )
+    return build.build_in_lane(
+        inner,
+        plant,
+        system.law,
+        system.certificate or {},
+        horizon=settings.controller.horizon,
+        car=(2.0 * CAR[0], 2.0 * CAR[1]),
+        planner="mppi",
+        friction=0,
+    )
+
+
 def _columns(settings: Settings, name: str, system: System) -> Row:
     """The columns of a row that do not depend on episodes."""
     protocol, certificate = settings.evaluation, system.certificate
@@ -262,7 +290,8 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
 def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds | None:
     """Claims of the certificate of a system about its predictions, or None."""
     level, horizon = settings.certification.level, settings.certification.horizon
-    if system.certificate is None:
+    # Those are about the middle of the road, which nobody follows on a course.
+    if system.certificate is None or has_course(settings):
         return None
     tube, d_bar = system.certificate["tube"], system.certificate["d_bar"]
     if (len(tube["latent"]), d_bar["level"]) != (horizon, level):
@@ -298,6 +327,9 @@ def drive(
     """Simulate, score and compare systems on the same episodes, with messages."""
     protocol, found = settings.evaluation, list[SystemResult]()
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
+    if has_course(settings):
+        # Only a corridor keeps a car clear of what it passes: the others stay at home.
+        systems = {n: one for n, one in systems.items() if one.certificate} or systems
     for name, system in systems.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         result = SystemEvaluation(settings, name, system)(episodes)
