@@ -9,7 +9,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import build, models, plants
-from sfkd_jax.experiment import command
+from sfkd_jax.experiment import command, evaluating
 
 CONF = Path(command.conf_path())
 OPTIONS = [
@@ -108,3 +108,10 @@ def test_logs_are_of_a_robot_of_ones_own_unless_a_plant_is_named():
 def test_a_planner_without_its_settings_is_refused():
     with pytest.raises(ValueError, match="choose the option controller=cem"):
         settings("controller.planner=cem")
+
+
+def test_only_a_system_with_a_corridor_drives_round_obstacles():
+    chosen = settings("+experiment=s3_body", "scenario=obstacles")
+    system = build.reference_systems(build.build_vehicle(chosen.vehicle))["oracle"]
+    with pytest.raises(ValueError, match=r"certified corridor, and oracle has none"):
+        evaluating.SystemEvaluation(chosen, "oracle", system, None)
