@@ -7,7 +7,7 @@ from helpers import TINY, any_law, path_space
 
 from sfkd_jax import data as datasets
 from sfkd_jax import models, policy, store
-from sfkd_jax.certification import issue, verify_document
+from sfkd_jax.certification import CertificationRefused, issue, verify_document
 from sfkd_jax.certification._measured import coverage_interval
 from sfkd_jax.certification._tubes import (
     ALONE,
@@ -65,7 +65,11 @@ DATA = BOX | {
 }
 
 
-def test_a_document_with_a_corridor_verifies():
+WIDE = DATA | {"acceleration": 2.0, "lateral_jerk": 7.0, "curvature_slope": 0.02}
+
+
+@pytest.mark.parametrize("data", [DATA, WIDE], ids=["bends", "groups"])
+def test_a_document_with_a_corridor_verifies(data):
     """As `certify` makes it, with fewer and shorter runs."""
     options = TINY | {"frame": "path", "transport": False, "budget": "joint"}
     model = models.sfkd(path_space(), **options)
@@ -96,7 +100,7 @@ def test_a_document_with_a_corridor_verifies():
     )
     small = {"runs": 24, "duration": 4.0, "attack_steps": 3000}
     document["corridor"] = certify_corridor(
-        loop, document["outputs"], DATA, 0.9, **small
+        loop, document["outputs"], data, 0.9, **small
     )
     hashes = {"policy_sha256": "0" * 64, "weights_sha256": "1" * 64}
     document |= hashes | {"versions": store.versions() | document["versions"]}
@@ -109,10 +113,25 @@ def test_a_document_with_a_corridor_verifies():
         "vehicle": {"dt": 0.1},
         "space": path_space()._asdict() | scales,
         "environment": {"low": BOX["env_low"], "high": BOX["env_high"]},
-        "dataset": DATA | {"segments": 120, "shares": (0.0, 1 / 3, 1 / 3, 1 / 3)},
+        "dataset": data | {"segments": 120, "shares": (0.0, 1 / 3, 1 / 3, 1 / 3)},
     }
     trained = policy.TrainedModel(
         model, params, kinematic(), any_law(), settings, "1" * 64, "0" * 64
     )
     # Read back: only then are tuples lists, as in a file.
     verify_document(store.plain(document), trained)
+    if "acceleration" in data:
+        check_groups(store.plain(document), trained)
+
+
+def check_groups(document, trained):
+    """The claim is that of the worst group, whatever the document says."""
+    corridor = document["corridor"]
+    groups = corridor["by_group"]
+    assert list(groups) == ["bends", "speeds", "lane_changes"]
+    for kind, bound in corridor["bounds"].items():
+        assert bound == max(group["bounds"][kind] for group in groups.values())
+    assert corridor["conditions"]["acceleration"] == 2.0
+    groups["lane_changes"]["bounds"]["nominal"] = 1e5
+    with pytest.raises(CertificationRefused, match=r"corridor\.bounds does not follow"):
+        verify_document(document, trained)

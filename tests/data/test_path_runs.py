@@ -12,7 +12,7 @@ from helpers import ENV_HIGH, ENV_LOW, any_law
 
 from sfkd_jax import plants
 from sfkd_jax.data import check_on_path, generate_along_path, to_path
-from sfkd_jax.scenarios import path_from_curvature
+from sfkd_jax.scenarios import DriveClass, path_from_curvature, random_drive
 from sfkd_jax.types import BODY, POSE, Trajectory
 
 PLANT = plants.kinematic()
@@ -109,3 +109,38 @@ def test_a_run_in_the_world_converts_to_path_coordinates():
     after = jax.vmap(LOOP.step)(along.states[:-1], along.controls, along.envs)
     np.testing.assert_allclose(after[:, 3:], along.states[1:, 3:], atol=2e-3)
     check_on_path(jax.tree.map(lambda leaf: leaf[None], along))
+
+
+def test_drives_of_every_group_stay_in_their_class_and_reach_its_ends():
+    limits = DriveClass(
+        speed=(3.0, 12.0),
+        peak_curvature=0.05,
+        acceleration=2.0,
+        lateral_jerk=7.0,
+        curvature_slope=0.02,
+    )
+    drive = partial(random_drive, limits=limits, steps=300, dt=0.1)
+    groups = jnp.repeat(jnp.arange(3), 40)
+    speed, curvature = jax.jit(jax.vmap(drive))(
+        jax.random.split(jax.random.key(0), 120), groups
+    )
+    turning = np.abs(curvature) * speed**2
+    slope = np.abs(np.diff(curvature)) / (0.1 * speed[:, 1:])
+    rate = np.abs(np.diff(speed)) / 0.1
+    left = np.sqrt(np.maximum(1.0 - (turning[:, :-1] / 2.0) ** 2, 0.0))
+    for value, most in (
+        (np.abs(curvature), 0.05),
+        (turning, 2.0),
+        (slope, 0.02),
+        (slope * speed[:, 1:] ** 3, 7.0),
+        (speed, 12.0),
+        (3.0 / speed, 1.0),
+    ):
+        each = np.max(np.asarray(value).reshape(3, -1), axis=1)
+        assert np.all(each <= most * 1.001)
+        assert np.max(each) >= most * 0.999
+    assert np.all(rate <= 2.0 * left + 1e-3)
+    assert np.max(rate[:40]) < 2.0 <= np.max(rate[40:80]) + 1e-3
+    # Lane changes turn to both sides and straight on between them.
+    lanes = np.asarray(curvature[80:])
+    assert np.mean(np.min(lanes, axis=1) < 0.0) > 0.9

@@ -9,7 +9,7 @@ the law reads the state through the sensors. The bounds are measured on these ru
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple, TypeAlias
@@ -26,32 +26,35 @@ from sfkd_jax.certification._alarms import (
 )
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
+from sfkd_jax.certification._loop import Loop, sensor_effect, spread_of
+from sfkd_jax.certification._loop import closed_loop as closed_loop
 from sfkd_jax.certification._measured import residuals
 from sfkd_jax.certification._tubes import (
+    ALONE,
     FORMS,
+    JOINT,
     calibrate_corridor,
     corridor_coverage,
     radii,
 )
-from sfkd_jax.control import PathLaw, safety_filter
+from sfkd_jax.control import safety_filter
 from sfkd_jax.data import drive_along_path, from_s3, sensor_keys
-from sfkd_jax.geometry import LATERAL, PERTURBATION, path_state
-from sfkd_jax.plants import Vehicle, along_path
+from sfkd_jax.geometry import LATERAL, path_state
 from sfkd_jax.ranges import Interval, Span
-from sfkd_jax.rollout import fold, rollout
-from sfkd_jax.scenarios import random_switching
+from sfkd_jax.rollout import rollout
+from sfkd_jax.scenarios import DRIVES, DriveClass, random_switching
 from sfkd_jax.types import (
     BODY,
     Control,
     Environment,
     Key,
-    Model,
     Params,
     State,
     Trajectory,
 )
 
-ROAD_SETTINGS = ("speed", "peak_curvature", "wavelengths", "lateral_acceleration")
+ROAD_SETTINGS = DriveClass._fields
+"""Settings of the data set that are the class of its drives."""
 EXCITATION = ("steering_excitation", "speed_excitation")
 STREAM, ALARMS = 4, 5
 """Streams folded into the data set's seed, of the corridor and of the test of
@@ -72,44 +75,6 @@ ELITE = 0.1
 """Part of a generation that the next one is drawn around."""
 
 
-class Loop(NamedTuple):
-    """The closed loop of plant and law, and the model of the policy.
-
-    Attributes:
-        plant: the true plant with the law around it.
-        law: of the policy, as are model and (folded) params.
-        noise: standard deviations of the sensors.
-    """
-
-    plant: Vehicle
-    law: PathLaw
-    model: Model
-    params: Params
-    noise: tuple[float, ...]
-
-
-def closed_loop(
-    plant: Vehicle,
-    model: Model,
-    params: Params,
-    law: PathLaw | None,
-    noise: Sequence[float],
-) -> Loop:
-    """Return the closed loop of a plant and a policy's parts, with folded weights.
-
-    Raises:
-        ValueError: the policy has no law, so that there is no closed loop.
-    """
-    if law is None:
-        raise ValueError(
-            "a corridor needs a policy in path coordinates, with its law: "
-            "model.frame=path"
-        )
-    folded = jax.jit(partial(fold, model))(params)
-    closed = along_path(plant, law, perturbation=law.perturbation)
-    return Loop(closed, law, model, folded, tuple(noise))
-
-
 def certify_corridor(
     loop: Loop,
     outputs: Mapping[str, Any],
@@ -124,8 +89,9 @@ def certify_corridor(
 ) -> dict[str, Any]:
     """Return the entry of the certificate about the corridor.
 
-    One part of `runs` fixes the units, one calibrates and one tests. The runs of S3,
-    which does not meet the conditions, are tested too.
+    Of each group of drives one part of `runs` fixes the units, one calibrates and one
+    tests; the bounds are those of the worst group. The runs of S3, which does not meet
+    the conditions, are tested too.
 
     Args:
         loop: of the policy.
@@ -146,12 +112,21 @@ def certify_corridor(
     began = time.perf_counter()
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     low, high = data["env_low"], data["env_high"]
-    excited = {name: data[name] for name in (*ROAD_SETTINGS, *EXCITATION)}
+    limits = DriveClass(**drive_class(data))
+    names = DRIVES if limits.acceleration else DRIVES[:1]
+    excited = {name: data[name] for name in EXCITATION}
     # Streams of their own: the data set's runs must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    sensors = partial(_sensor_effect, loop)
-    options = excited | {"sensors": sensors, "offset": (0.0, 0.0, 0.0), "burn_in": 0}
+    drive = partial(
+        drive_along_path,
+        loop.plant,
+        limits=limits,
+        sensors=partial(sensor_effect, loop),
+        offset=(0.0, 0.0, 0.0),
+        burn_in=0,
+        **excited,
+    )
     steps, dt = round(duration / loop.plant.dt), loop.plant.dt
     switching = partial(
         random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
@@ -159,8 +134,9 @@ def certify_corridor(
 
     def driven(conditions: Callable[[Key], Array], key: Key) -> Trajectory:
         env_key, run_key = jax.random.split(key)
-        envs = jax.vmap(conditions)(jax.random.split(env_key, runs))
-        return drive_along_path(loop.plant, envs, run_key, **options)
+        groups = jnp.repeat(jnp.arange(len(names)), runs)
+        envs = jax.vmap(conditions)(jax.random.split(env_key, len(groups)))
+        return drive(envs, run_key, groups=groups)
 
     # Jitted once each: the three parts under the conditions share one program.
     switching = jax.jit(partial(driven, switching))
@@ -172,7 +148,7 @@ def certify_corridor(
         for kind, run_key, key in keys
     ]
     units, calibration, test, s3 = (scores for *_, scores in measured)
-    bounds = calibrate_corridor(units, calibration, level=level)
+    bounds, shares = _worst_group(names, units, calibration, test, level)
     lateral, nominal, _ = measured[2]
     conditions = {
         "env_box": [low, high],
@@ -192,12 +168,12 @@ def certify_corridor(
     key = stream(ALARMS)
     alarms = calibrate_innovations(seen, seen_s3, key, duration=duration)
     return {
-        "conditions": excited | conditions,
+        "conditions": drive_class(data) | excited | conditions,
         "level": level,
         "runs": runs,
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bound,
-        **corridor_coverage(bounds, test),
+        **shares,
         # S3 does not meet the conditions: reported beside the claim, never in it.
         "by_scenario": {"s3": corridor_coverage(bounds, s3)},
         "seen": {
@@ -209,6 +185,41 @@ def certify_corridor(
         "shield_horizon": horizon,
         "seconds": time.perf_counter() - began,
     }
+
+
+def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a data set that say which drives a corridor is about.
+
+    Data of older versions, and those without groups, have the first four.
+    """
+    names = ROAD_SETTINGS if data.get("acceleration") else ROAD_SETTINGS[:4]
+    return {name: data[name] for name in names}
+
+
+def _worst_group(
+    names: tuple[str, ...],
+    units: np.ndarray,
+    calibration: np.ndarray,
+    test: np.ndarray,
+    level: float,
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """The bounds of the worst group and their coverage; runs are group after group."""
+    own, shares = {}, {}
+    units, calibration, test = (
+        np.split(part, len(names)) for part in (units, calibration, test)
+    )
+    for name, *parts in zip(names, units, calibration, strict=True):
+        own[name] = calibrate_corridor(*parts, level=level)
+    bounds = {
+        kind: max(each[kind] for each in own.values()) for kind in (*JOINT, *ALONE)
+    }
+    for name, part in zip(names, test, strict=True):
+        shares[name] = corridor_coverage(bounds, part)
+    least = min(shares.values(), key=lambda share: share["coverage"])
+    if len(names) == 1:
+        return bounds, least
+    groups = {name: {"bounds": own[name]} | shares[name] for name in names}
+    return bounds, least | {"by_group": groups}
 
 
 def _measure(
@@ -239,7 +250,7 @@ def _simulate_nominal(
 
     ẑ_0 is the latent state of a nominal model that starts at the measured state.
     """
-    model, spread = loop.model, _spread(loop.noise, runs.states.shape[-1])
+    model, spread = loop.model, spread_of(loop.noise, runs.states.shape[-1])
 
     def lateral(run: Trajectory) -> Array:
         return rollout(model, loop.params, run)[0][:, BODY][:, LATERAL]
@@ -256,36 +267,14 @@ def _simulate_nominal(
     return jax.vmap(lateral)(runs), gaps
 
 
-def _sensor_effect(
-    loop: Loop, key: Key, state: State, inputs: Control, env: Environment
-) -> Array:
-    """Return the change of ν because the law reads ξ through the sensors."""
-    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
-    spread = _spread(loop.noise, state.shape[-1])[BODY]
-    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
-    # A law is a known function: reading ξ + n acts like a perturbation of ν.
-    return loop.law(measured, road[0], road[1], env) - loop.law(
-        coordinates, road[0], road[1], env
-    )
-
-
 def _observed(loop: Loop, runs: Trajectory, key: Key) -> Observed:
     """Innovations of `driven` runs with the noise that their law read."""
     # The keys of the runs, as `driven` makes them of the same one.
     keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
-    spread = _spread(loop.noise, runs.states.shape[-1])[BODY]
+    spread = spread_of(loop.noise, runs.states.shape[-1])[BODY]
     noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
     given = loop.model, loop.params, loop.law, runs, spread * noise
     return innovations(*given, loop.plant.dt)
-
-
-def _spread(noise: tuple[float, ...], size: int) -> Array:
-    """Standard deviations of a path state from those of the sensors.
-
-    e_y takes that of a position, e_ψ that of yaw, the other coordinates their own.
-    """
-    known = noise[1 : size - 2]
-    return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
 
 
 Runs: TypeAlias = tuple[Array, Array]

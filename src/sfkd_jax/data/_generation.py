@@ -13,12 +13,15 @@ from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import path_state
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.ranges import Interval, Positive, Span
+from sfkd_jax.ranges import Interval, NonNegative, Positive, Span
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.scenarios import (
+    DRIVES,
+    DriveClass,
     family,
     held_road,
     project,
+    random_drive,
     random_switching,
     reference_window,
     smooth_path,
@@ -59,6 +62,7 @@ CORRELATION = 0.85
 """Of the excitation with that of the step before."""
 BATCH = 500
 """Runs simulated at once."""
+DEFAULT = DriveClass()
 SENSORS = 3
 """Folded into a run's key, which is also split for road, ν and start."""
 
@@ -123,6 +127,9 @@ def generate_along_path(
     peak_curvature: Positive = 0.02,
     wavelengths: Span = (50.0, 200.0),
     lateral_acceleration: Positive = 2.0,
+    acceleration: NonNegative = 0.0,
+    lateral_jerk: Positive = 7.0,
+    curvature_slope: Positive = 0.02,
     steering_excitation: Span = (0.002, 0.025),
     speed_excitation: Span = (0.05, 0.6),
     env_low: tuple[float, ...],
@@ -160,10 +167,15 @@ def generate_along_path(
         loop,
         jnp.concatenate(envs),
         run_key,
-        speed=speed,
-        peak_curvature=peak_curvature,
-        wavelengths=wavelengths,
-        lateral_acceleration=lateral_acceleration,
+        limits=DriveClass(
+            speed,
+            peak_curvature,
+            wavelengths,
+            lateral_acceleration,
+            acceleration,
+            lateral_jerk,
+            curvature_slope,
+        ),
         steering_excitation=steering_excitation,
         speed_excitation=speed_excitation,
     )
@@ -295,10 +307,8 @@ def drive_along_path(
     envs: Float[Array, "run time environment"],
     key: Key,
     *,
-    speed: tuple[float | Scalar, float | Scalar] = (8.0, 10.5),
-    peak_curvature: float = 0.02,
-    wavelengths: Range = (50.0, 200.0),
-    lateral_acceleration: float = 2.0,
+    limits: DriveClass = DEFAULT,
+    groups: Int[Array, " run"] | None = None,
     steering_excitation: Range = (0.002, 0.025),
     speed_excitation: Range = (0.05, 0.6),
     offset: tuple[float, float, float] = (0.1, 0.02, 0.5),
@@ -307,41 +317,33 @@ def drive_along_path(
 ) -> Trajectory:
     """Simulate one run in each of the given environments.
 
-    The speed varies slowly within its range. A third of the roads are circles, the
-    curvature of the others is a sum of three sinusoids; none exceeds `peak_curvature`
-    or `lateral_acceleration`. ν of a run is an AR(1) process, as of a planner, or its
-    sign (bang-bang), with a log-uniform spread, clipped to the limits of the loop.
+    Speed and curvature are those of `random_drive`. ν of a run is an AR(1) process, as
+    of a planner, or its sign (bang-bang), with a log-uniform spread, clipped to the
+    limits of the loop.
 
     Args:
         loop: of `vehicle.along_path`.
         envs: of the plant.
         key: consumed.
-        speed: range of v_ref [m/s].
-        peak_curvature: [1/m].
-        wavelengths: of the road [m].
-        lateral_acceleration: largest v_ref² |κ| [m/s²].
+        limits: the class of the drives.
+        groups: of `DRIVES`, as index; by default one after another.
         steering_excitation: range of the spread of ν_1 [rad].
         speed_excitation: of ν_2 [m/s² or m/s].
         offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start.
         burn_in: steps simulated before a run starts.
         sensors: noise of the law's sensors; it is not part of w.
     """
-    limits = jnp.asarray([steering_excitation, speed_excitation])
-    road = partial(
-        _road,
-        dt=loop.dt,
-        speed=speed,
-        peak=peak_curvature,
-        wavelengths=wavelengths,
-        most=lateral_acceleration,
-    )
+    spread = jnp.asarray([steering_excitation, speed_excitation])
+    drive = partial(random_drive, limits=limits, dt=loop.dt)
+    if groups is None:
+        groups = jnp.arange(envs.shape[0]) % len(DRIVES)
 
-    def one(given: tuple[Array, Key]) -> Trajectory:
+    def one(given: tuple[Array, Key, Array]) -> Trajectory:
         envs = jnp.concatenate([jnp.repeat(given[0][:1], burn_in, axis=0), given[0]])
         road_key, nu_key, start_key = jax.random.split(given[1], 3)
         sensor_keys = _sensor_keys(given[1], envs.shape[0])
-        speeds, curvatures = road(road_key, steps=envs.shape[0])
-        nus = _perturbations(nu_key, steps=envs.shape[0], spread=limits)
+        speeds, curvatures = drive(road_key, given[2], steps=envs.shape[0])
+        nus = _perturbations(nu_key, steps=envs.shape[0], spread=spread)
         nus = jnp.clip(
             nus, jnp.asarray(loop.control_low[:2]), jnp.asarray(loop.control_high[:2])
         )
@@ -365,7 +367,7 @@ def drive_along_path(
         return Trajectory(states[burn_in:], inputs[burn_in:], envs[burn_in:])
 
     keys = jax.random.split(key, envs.shape[0])
-    return in_batches(one, (envs, keys), size=BATCH)
+    return in_batches(one, (envs, keys, groups), size=BATCH)
 
 
 def _sensor_keys(key: Key, steps: int) -> Array:
@@ -379,48 +381,6 @@ def sensor_keys(key: Key, runs: int, steps: int) -> Array:
     Without a burn-in, with its key; so that what the law measured can be drawn again.
     """
     return jax.vmap(lambda run: _sensor_keys(run, steps))(jax.random.split(key, runs))
-
-
-def _road(
-    key: Key,
-    *,
-    steps: int,
-    dt: float,
-    speed: tuple[float | Scalar, float | Scalar],
-    peak: float,
-    wavelengths: Range,
-    most: float,
-) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
-    """v_ref [m/s] and κ [1/m] at every step."""
-    level_key, swing_key, wave_key, phase_key, size_key, kind_key, circle_key = (
-        jax.random.split(key, 7)
-    )
-    level = jax.random.uniform(level_key, (), minval=speed[0], maxval=speed[1])
-    swing, period, begins = jax.random.uniform(swing_key, (3,))
-    time = jnp.arange(steps) * dt
-    speeds = level + 0.8 * swing * jnp.sin(
-        2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins)
-    )
-    # The swing is not scaled to the range, so that its ends are reached.
-    speeds = jnp.clip(speeds, *speed)
-    waves = jax.random.uniform(
-        wave_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1]
-    )
-    phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
-    along = jnp.cumsum(speeds) * dt
-    bends = jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases), axis=0)
-    # Three sinusoids seldom peak together: twice their mean, clipped, stays at the
-    # extremes for a while as well.
-    bends = jnp.sqrt(jax.random.uniform(size_key)) * jnp.clip(2.0 * bends, -1.0, 1.0)
-    # Wider than [-1, 1], then clipped: a third of the circles are the tightest.
-    circle = jnp.clip(
-        jax.random.uniform(circle_key, minval=-1.5, maxval=1.5), -1.0, 1.0
-    )
-    # A third of the roads are circles: the steady turn is where e_y settles widest.
-    wanted = peak * jnp.where(jax.random.uniform(kind_key) < 1.0 / 3.0, circle, bends)
-    # Friction limits v² κ: a fast road has to be a straight one.
-    tightest = jnp.minimum(peak, most / speeds**2)
-    return speeds, jnp.clip(wanted, -tightest, tightest)
 
 
 def _perturbations(

@@ -14,6 +14,9 @@ from sfkd_jax.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.scenarios._conditions import wet_road as wet_road
+from sfkd_jax.scenarios._drives import DRIVES as DRIVES
+from sfkd_jax.scenarios._drives import DriveClass as DriveClass
+from sfkd_jax.scenarios._drives import random_drive as random_drive
 from sfkd_jax.scenarios._obstacles import CAR as CAR
 from sfkd_jax.scenarios._obstacles import Course as Course
 from sfkd_jax.scenarios._obstacles import beside as beside
