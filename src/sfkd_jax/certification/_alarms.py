@@ -1,10 +1,10 @@
-"""Calibration of the test of innovations on runs under the conditions of a corridor."""
+"""A closed loop with its sensors, and the test of innovations on its runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,20 @@ from sfkd_jax.control import (
     steering_level,
     turning_rate,
 )
-from sfkd_jax.geometry import HEADING
-from sfkd_jax.types import BODY, Key, Model, Params, Trajectory
+from sfkd_jax.data import sensor_keys
+from sfkd_jax.geometry import HEADING, PERTURBATION
+from sfkd_jax.plants import Vehicle, along_path
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Key,
+    Model,
+    Params,
+    State,
+    Trajectory,
+)
 
 BATCHES = 10
 """Simulations of all runs for the calibration; half of them fix the units."""
@@ -34,26 +46,86 @@ Observed: TypeAlias = tuple[Float[Array, "run gap chart"], Float[Array, "run gap
 """Innovations and levels."""
 
 
-def innovations(
+class Loop(NamedTuple):
+    """The closed loop of plant and law, and the model of the policy.
+
+    Attributes:
+        plant: the true plant with the law around it.
+        law: of the policy, as are model and (folded) params.
+        noise: standard deviations of the sensors.
+    """
+
+    plant: Vehicle
+    law: PathLaw
+    model: Model
+    params: Params
+    noise: tuple[float, ...]
+
+
+def closed_loop(
+    plant: Vehicle,
     model: Model,
     params: Params,
-    law: PathLaw,
-    runs: Trajectory,
-    noise: Float[Array, "run time coordinate"],
-    dt: float,
-) -> Observed:
-    """Return the innovations of runs whose law read ξ with this noise, and levels."""
+    law: PathLaw | None,
+    noise: Sequence[float],
+) -> Loop:
+    """Return the closed loop of a plant and a policy's parts, with folded weights.
+
+    Raises:
+        ValueError: the policy has no law, so that there is no closed loop.
+    """
+    if law is None:
+        raise ValueError(
+            "a corridor needs a policy in path coordinates, with its law: "
+            "model.frame=path"
+        )
+    folded = jax.jit(partial(fold, model))(params)
+    closed = along_path(plant, law, perturbation=law.perturbation)
+    return Loop(closed, law, model, folded, tuple(noise))
+
+
+def sensor_effect(
+    loop: Loop, key: Key, state: State, inputs: Control, env: Environment
+) -> Array:
+    """Return the change of ν because the law reads ξ through the sensors."""
+    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
+    spread = spread_of(loop.noise, state.shape[-1])[BODY]
+    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
+    # A law is a known function: reading ξ + n acts like a perturbation of ν.
+    return loop.law(measured, road[0], road[1], env) - loop.law(
+        coordinates, road[0], road[1], env
+    )
+
+
+def spread_of(noise: tuple[float, ...], size: int) -> Array:
+    """Standard deviations of a path state from those of the sensors.
+
+    e_y takes that of a position, e_ψ that of yaw, the other coordinates their own.
+    """
+    known = noise[1 : size - 2]
+    return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
+
+
+def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:
+    """Return innovations and levels of runs, with the noise that their law read.
+
+    `key` made the runs: one half of it drew the environments, the other one the rest.
+    """
+    model, law = loop.model, loop.law
+    keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
+    spread = spread_of(loop.noise, runs.states.shape[-1])[BODY]
+    noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
 
     def step(xi: Array, after: Array, inputs: Array, env: Array) -> tuple[Array, Array]:
-        fiber, road = model.fiber(params, env), inputs[2:]
+        fiber, road = model.fiber(loop.params, env), inputs[2:]
         # ν beside the law of what was measured: the noise in the control cancels.
         expected = expected_coordinates(model, fiber, xi, inputs[:2], road)
         control = law(xi, road[0], road[1], env) + inputs[:2]
-        turned = dt * turning_rate(law, xi, control, road, env)
+        turned = loop.plant.dt * turning_rate(law, xi, control, road, env)
         innovation = jnp.append(after - expected, (after - xi)[HEADING] - turned)
         return innovation, steering_level(law, road, env)
 
-    measured = runs.states[:, :-1, BODY] + noise
+    measured = runs.states[:, :-1, BODY] + spread * noise
     given = measured[:, :-1], measured[:, 1:], runs.controls[:, :-1], runs.envs[:, :-1]
     return jax.vmap(jax.vmap(step))(*given)
 

@@ -20,14 +20,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._alarms import (
-    Observed,
+    Loop,
     calibrate_innovations,
     innovations,
+    sensor_effect,
+    spread_of,
 )
+from sfkd_jax.certification._alarms import closed_loop as closed_loop
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
-from sfkd_jax.certification._loop import Loop, sensor_effect, spread_of
-from sfkd_jax.certification._loop import closed_loop as closed_loop
 from sfkd_jax.certification._measured import residuals
 from sfkd_jax.certification._tubes import (
     ALONE,
@@ -38,7 +39,7 @@ from sfkd_jax.certification._tubes import (
     radii,
 )
 from sfkd_jax.control import safety_filter
-from sfkd_jax.data import drive_along_path, from_s3, sensor_keys
+from sfkd_jax.data import drive_along_path, from_s3
 from sfkd_jax.geometry import LATERAL, path_state
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import rollout
@@ -161,7 +162,7 @@ def certify_corridor(
     held = max(1, round(dwell[0] / dt))
     bound = bounds["vehicle_to_nominal_position"]
     search = _Search(loop, claims["position"], bound, data, held, attack_steps)
-    observe = jax.jit(partial(_observed, loop))
+    observe = jax.jit(partial(innovations, loop))
     seen, seen_s3 = (
         lambda key, kind=kind: observe(kind(key), key) for kind in kinds[2:]
     )
@@ -265,16 +266,6 @@ def _simulate_nominal(
     keys = jax.random.split(key, len(runs.states))
     gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
     return jax.vmap(lateral)(runs), gaps
-
-
-def _observed(loop: Loop, runs: Trajectory, key: Key) -> Observed:
-    """Innovations of `driven` runs with the noise that their law read."""
-    # The keys of the runs, as `driven` makes them of the same one.
-    keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
-    spread = spread_of(loop.noise, runs.states.shape[-1])[BODY]
-    noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
-    given = loop.model, loop.params, loop.law, runs, spread * noise
-    return innovations(*given, loop.plant.dt)
 
 
 Runs: TypeAlias = tuple[Array, Array]
