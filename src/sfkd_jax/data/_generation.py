@@ -62,7 +62,6 @@ CORRELATION = 0.85
 """Of the excitation with that of the step before."""
 BATCH = 500
 """Runs simulated at once."""
-DEFAULT = DriveClass()
 SENSORS = 3
 """Folded into a run's key, which is also split for road, ν and start."""
 
@@ -307,7 +306,7 @@ def drive_along_path(
     envs: Float[Array, "run time environment"],
     key: Key,
     *,
-    limits: DriveClass = DEFAULT,
+    limits: DriveClass,
     groups: Int[Array, " run"] | None = None,
     steering_excitation: Range = (0.002, 0.025),
     speed_excitation: Range = (0.05, 0.6),
