@@ -77,9 +77,9 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 25_420, "tests": 15_380, "benchmarks, experiments": 2_300}
+LINES = {"src": 25_680, "tests": 15_450, "benchmarks, experiments": 2_300}
 """As they are; 20 000 and 15 000 are aimed at."""
-FILES_IN_SRC = 133
+FILES_IN_SRC = 134
 
 OPTIONS, EXPERIMENTS = 66, 10
 COMMITTED = {"*.json": 685_000, "figures": 2_600_000}
