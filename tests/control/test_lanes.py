@@ -234,6 +234,26 @@ def test_where_nothing_is_admissible_it_stops_in_front_and_goes_on_later(lane, r
     assert not bool(rows[-1][2]["stopping"])
 
 
+def test_somebody_who_crosses_is_passed_where_he_is_then(lane, road):
+    """At 1.5 m/s, predicted at every step: he would be on the centre line with it."""
+    steps = np.arange(160.0)
+    at = np.stack([np.full(160, 62.0), 9.3 - 0.15 * steps], 1)
+    walk = np.asarray(beside(road, at))
+
+    def seen(number, car, ahead=60):
+        return circles(jnp.asarray(walk[number : number + 1]), 0.4)._replace(
+            position=jnp.asarray(walk[None, number : number + ahead])
+        )
+
+    rows = drive(lane, road, seen, 95)
+    for number, (car, _, info) in enumerate(rows):
+        real = room(car, seen(number, car, 1))
+        assert real > KIND.margin
+        assert info["clearance"] <= real + 1e-3
+    cars = np.stack([car for car, _, _ in rows])
+    assert cars[-1, 0] > 75.0
+
+
 @pytest.mark.parametrize("attack", ["jumps", "inside", "nan", "edge"])
 def test_what_is_attacked_is_not_admitted(lane, road, attack):
     none = circles(beside(road, POSTS[:1]), 0.8)

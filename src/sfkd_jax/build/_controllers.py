@@ -410,7 +410,9 @@ def build_in_lane(
         half=(0.5 * car[0], 0.5 * car[1]),
         corridor=corridor["corridor_m"],
         heading=0.0 if state is None else max(abs(end[HEADING]) for end in state),
+        braking=6.0 if plant.speed_loop else -plant.control_low[1],
     )
+    follows = float(np.mean(law.gain[..., 1, PATH_SPEED]))
     manoeuvres = control.Manoeuvres(kind=kind, dt=plant.dt)
     search = PLANNERS[planner](manoeuvres.task(), **SEARCH, **SEARCHES.get(planner, {}))
     return control.in_lane(
@@ -418,6 +420,7 @@ def build_in_lane(
         planner=search,
         manoeuvres=manoeuvres,
         horizon=horizon,
+        lead=0.0 if plant.speed_loop else 1.0 / follows,
         friction=friction,
         lowest=certificate["boxes"]["env"][0][friction or 0],
     )

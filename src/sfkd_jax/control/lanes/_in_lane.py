@@ -24,7 +24,6 @@ from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Lap, point_at, project
 from sfkd_jax.ranges import (
     AtLeastOne,
-    Fraction,
     NonNegative,
     NonNegativeInt,
     Positive,
@@ -92,7 +91,8 @@ class InLane:
         period: number of steps from one search to the next.
         friction: entry of e that is the friction; None if none is.
         lowest: friction where e is not known.
-        share: of the grip that a plan may use.
+        lead: time by which the speed of the reference is ahead of its position [s]: a
+            law follows a falling speed that much later.
         better: relative gain of a reference that replaces the committed one.
     """
 
@@ -104,7 +104,7 @@ class InLane:
     period: AtLeastOne = 3
     friction: NonNegativeInt | None = 0
     lowest: Positive = 0.3
-    share: Fraction = 0.7
+    lead: NonNegative = 0.0
     better: NonNegative = 0.01
 
     def __post_init__(self) -> None:
@@ -153,10 +153,12 @@ class InLane:
             lambda: (state.planner, situation.committed),
         )
         judged = task.judge(weights, situation, committed)
-        place, (dt, horizon) = situation.place, (task.dt, self.horizon)
-        ahead = window(
-            lane.path, committed, judged.curve, place, dt=dt, horizon=horizon
+        times = task.dt * jnp.arange(1, self.horizon + 1)
+        ahead = window(lane.path, committed, judged.curve, situation.place, times)
+        later = window(
+            lane.path, committed, judged.curve, situation.place, times + self.lead
         )
+        ahead = ahead.at[:, 3].set(later[:, 3])
         control, inner, info = self.inner.act(
             params, state.inner, observation, env, ahead
         )
@@ -167,7 +169,9 @@ class InLane:
             **info,
             "healthy": info["healthy"] & clean,
             "reference": ahead,
-            "offset": jnp.interp(place, jnp.arange(self.samples), committed.move[0]),
+            "offset": jnp.interp(
+                situation.place, jnp.arange(self.samples), committed.move[0]
+            ),
             "clearance": jnp.where(clean, room, jnp.nan),
             "admissible": (judged.violation <= 0.0) & clean,
             "stopping": ~judged.curve.reached[-1],
@@ -220,8 +224,10 @@ class InLane:
         )
         friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
         friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
-        place, grip = progress / path.spacing - first, self.share * GRAVITY * friction
-        return progress, Situation(road, committed, obstacles, place, grip)
+        place = progress / path.spacing - first
+        return progress, Situation(
+            road, committed, obstacles, place, GRAVITY * friction
+        )
 
     def _search(
         self,

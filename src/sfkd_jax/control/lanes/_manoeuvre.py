@@ -23,11 +23,13 @@ from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task
 from sfkd_jax.geometry import SMALLEST_SCALE
 from sfkd_jax.lanes import Obstacles, distance
 from sfkd_jax.paths import quintic
-from sfkd_jax.ranges import NonNegative, Positive, Span, check_intervals
+from sfkd_jax.ranges import Fraction, NonNegative, Positive, Span, check_intervals
 from sfkd_jax.types import Control, Params, Scalar
 
 SHORTEST = 12.0
 """Of a lateral move [m]."""
+ALMOST = 0.95
+"""Share of the grip of a stop that cannot be gentler."""
 LATE = 0.03
 """Distances are those at samples; in between an obstacle may be nearer by less [m]."""
 
@@ -46,6 +48,8 @@ class Class:
         heading: bound of |e_ψ| [rad].
         acceleration: largest [m/s²].
         deceleration: largest in a planned change of speed [m/s²].
+        braking: largest of a stop that cannot be gentler [m/s²].
+        share: of the grip that is planned with.
     """
 
     curvature: Positive
@@ -55,8 +59,10 @@ class Class:
     half: tuple[Positive, Positive]
     corridor: NonNegative
     heading: NonNegative
-    acceleration: Positive = 0.5
+    acceleration: Positive = 1.0
     deceleration: Positive = 1.0
+    braking: Positive = 6.0
+    share: Fraction = 0.7
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -75,7 +81,7 @@ class Situation(NamedTuple):
         committed: reference, from the same sample on.
         obstacles: all of them finite.
         place: of the car, in samples from the first one.
-        grip: acceleration that a plan may use [m/s²].
+        grip: acceleration that the tyres allow [m/s²].
     """
 
     road: RoadAhead
@@ -208,7 +214,8 @@ class Manoeuvres:
         start = before.square[BEHIND]
         # Beside the lateral acceleration of the bend.
         bend = start * jnp.abs(judged.curve.curvature[BEHIND])
-        grip = jnp.sqrt(jnp.maximum(situation.grip**2 - bend**2, 0.01))
+        grip = jnp.sqrt(jnp.maximum((ALMOST * situation.grip) ** 2 - bend**2, 0.01))
+        grip = jnp.minimum(grip, self.kind.braking)
         gentle = jnp.minimum(self.kind.deceleration, grip)
         until = jnp.where(clean, jnp.argmax(judged.blocked), 0)
         until = until * spacing - self.standoff
@@ -224,6 +231,7 @@ class Manoeuvres:
     def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
         """Return what a reference costs, how far it leaves the class, and its room."""
         road, kind, square = situation.road, self.kind, plan.square
+        lateral = jnp.minimum(kind.lateral, kind.share * situation.grip)
         along = curve(road, plan)
         curvature = along.curvature
         turning = jnp.append(jnp.diff(curvature) / along.lengths, 0.0)
@@ -231,7 +239,7 @@ class Manoeuvres:
             [
                 jnp.abs(curvature) / kind.curvature,
                 jnp.abs(turning) / kind.turning,
-                square * jnp.abs(curvature) / jnp.minimum(kind.lateral, situation.grip),
+                square * jnp.abs(curvature) / lateral,
                 square / kind.speed[1] ** 2,
                 jnp.where(along.scale < SMALLEST_SCALE, 2.0, 0.0),
             ]

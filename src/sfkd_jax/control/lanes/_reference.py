@@ -203,19 +203,16 @@ def window(
     committed: Committed,
     along: Curve,
     place: Scalar,
-    *,
-    dt: float,
-    horizon: int,
+    times: Float[Array, " horizon"],
 ) -> Reference:
-    """Return the next points of the reference, x, y, yaw, speed, (horizon, 4).
+    """Return points of the reference, x, y, yaw, speed, (horizon, 4).
 
     Args:
         path: that the reference is beside.
         committed: the reference.
         along: the same in the world.
         place: of the car, in samples from the first one.
-        dt: sampling period [s].
-        horizon: number of points, the first one dt ahead.
+        times: of the points, from now on [s].
     """
     squares, spacing = committed.square, path.spacing
     speed = jnp.sqrt(squares)
@@ -226,7 +223,7 @@ def window(
     passed = (place - here) * along.lengths[here]
     now = jnp.sqrt(jnp.maximum(squares[here] + 2.0 * slopes[here] * passed, 0.0))
     since = 2.0 * passed / jnp.maximum(speed[here] + now, STANDS)
-    times = along.times[here] + since + dt * jnp.arange(1, horizon + 1)
+    times = along.times[here] + since + times
 
     def point(time: Scalar) -> Float[Array, " 4"]:
         at = jnp.clip(jnp.searchsorted(along.times, time, side="right") - 1, 0, last)
