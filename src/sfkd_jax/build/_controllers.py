@@ -13,6 +13,7 @@ from sfkd_jax.geometry import (
     CURVATURE,
     HEADING,
     LATERAL,
+    PATH_SPEED,
     REFERENCE_SPEED,
 )
 from sfkd_jax.rollout import with_offset
