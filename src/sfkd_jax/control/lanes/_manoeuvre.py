@@ -277,6 +277,7 @@ class Manoeuvres:
         gap, _ = jax.lax.scan(nearer, gap, situation.obstacles)
         edge = jnp.minimum(road.left - move[0], road.right + move[0])
         edge = edge - half[1] - half[0] * jnp.abs(move[1]) / along.stretch
-        counts = along.reached & (samples >= BEHIND)
+        # The car is between two samples, and both count, also where it stands.
+        counts = (along.reached | (samples == BEHIND + 1)) & (samples >= BEHIND)
         room = gap - LATE, edge
         return [jnp.where(counts, one - self.kind.margin, jnp.inf) for one in room]
