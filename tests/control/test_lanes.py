@@ -20,6 +20,7 @@ KIND = control.Class(
     curvature=0.02,
     turning=0.0025,
     lateral=2.0,
+    jerk=2.9,
     speed=(8.0, 10.5),
     half=(2.25, 0.9),
     corridor=0.14,

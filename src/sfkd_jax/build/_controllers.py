@@ -401,13 +401,16 @@ def build_in_lane(
     """
     corridor, road = certificate["corridor"], certificate["boxes"]["control"]
     under, state = corridor["conditions"], _conditions(certificate).state
-    # The sharpest slope of the sinusoids that the roads of the class are made of.
-    turning = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
+    # The sharpest slope of the sinusoids that the roads of the class are made of; one
+    # with lane changes states it.
+    sharpest = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
+    turning, fastest = under.get("curvature_slope", sharpest), road[1][REFERENCE_SPEED]
     kind = control.Class(
         curvature=min(under["peak_curvature"], road[1][CURVATURE]),
         turning=turning,
         lateral=min(under["lateral_acceleration"], float(law.high[0])),
-        speed=(road[0][REFERENCE_SPEED], road[1][REFERENCE_SPEED]),
+        jerk=under.get("lateral_jerk", turning * fastest**3),
+        speed=(road[0][REFERENCE_SPEED], fastest),
         half=(0.5 * car[0], 0.5 * car[1]),
         corridor=corridor["corridor_m"],
         heading=0.0 if state is None else max(abs(end[HEADING]) for end in state),

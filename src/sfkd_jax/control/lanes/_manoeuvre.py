@@ -42,6 +42,7 @@ class Class:
         curvature: largest [1/m].
         turning: largest change of the curvature per length [1/m²].
         lateral: largest v² κ [m/s²].
+        jerk: largest v³ times the change of κ per length [m/s³].
         speed: lowest and highest [m/s].
         half: half of the length and width of the car [m].
         corridor: bound of |e_y| [m].
@@ -55,6 +56,7 @@ class Class:
     curvature: Positive
     turning: Positive
     lateral: Positive
+    jerk: Positive
     speed: Span
     half: tuple[Positive, Positive]
     corridor: NonNegative
@@ -239,6 +241,7 @@ class Manoeuvres:
             [
                 jnp.abs(curvature) / kind.curvature,
                 jnp.abs(turning) / kind.turning,
+                square**1.5 * jnp.abs(turning) / kind.jerk,
                 square * jnp.abs(curvature) / lateral,
                 square / kind.speed[1] ** 2,
                 jnp.where(along.scale < SMALLEST_SCALE, 2.0, 0.0),
