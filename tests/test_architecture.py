@@ -82,7 +82,7 @@ LINES = {"src": 25_680, "tests": 15_450, "benchmarks, experiments": 2_300}
 FILES_IN_SRC = 134
 
 OPTIONS, EXPERIMENTS = 66, 10
-COMMITTED = {"*.json": 685_000, "figures": 2_600_000}
+COMMITTED = {"*.json": 1_070_000, "figures": 2_600_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""
 LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9

@@ -59,10 +59,13 @@ def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
     (measured,) = (line for line in text.splitlines() if "not signed" in line)
     assert f"alpha {document['alpha']:.4f}" in proved
     assert f"{document['d_bar']['value']:.3g}" in measured
-    along = vehicle.endswith("_path")
-    for fact in ("v_ref [m/s] 8 … 10.5", "curvature [1/m] -0.02 … 0.02", "3 to 6 s"):
-        assert (fact in text) == along
-    if along:
+    ranges = {
+        "path": ("v_ref [m/s] 8 … 10.5", "curvature [1/m] -0.02 … 0.02", "3 to 6 s"),
+        "lane": ("v_ref [m/s] 3 … 12", "curvature [1/m] -0.05 … 0.05", "3 to 6 s"),
+    }
+    for kind, facts in ranges.items():
+        assert all(fact in text for fact in facts) == vehicle.endswith(kind)
+    if "_" in vehicle:
         assert f"{document['corridor']['corridor_m']:.3f} m" in measured
     assert "nothing is proved" in repr(replace(trained, certificate=None))
 

@@ -66,7 +66,7 @@ def _load(settings: Settings, directory: Path) -> policy.Policy:
     if directory.is_dir():
         trained = policy.load(directory, controller=plain(settings.controller))
     if trained is None or trained.settings["vehicle"] != plain(settings.vehicle):
-        names = sorted({one.name.removesuffix(ALONG_PATH) for one in SHIPPED.iterdir()})
+        names = sorted({one.name.split("_")[0] for one in SHIPPED.iterdir()})
         raise ValueError(
             f"controllers ship for {' and '.join(names)} as they are; "
             "for another vehicle run train"
