@@ -6,7 +6,6 @@ Law, planner and roads are equal in all rows of a case; no shield. Every setting
 on episodes of seed 100. Writes benchmarks/adaptation.json, one line a row.
 """
 
-import argparse
 import json
 from functools import partial
 from pathlib import Path
@@ -16,14 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, evaluation, plants, policy, scenarios
+from benchmarks import arguments, write
+from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
+from sfkd_jax import build, plants, policy
 from sfkd_jax.evaluation import metrics
 from sfkd_jax.plants import equivalent_wind
 from sfkd_jax.scenarios import random_side_forces
 
-SETTLED, HORIZON = 20, 20
-"""Steps at the start that do not count, 2 s; steps of a plan."""
-NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
 LEADS = (1, 5, 10, 20)
 """Steps ahead whose coverage is reported."""
 GRIP = 1.2
@@ -66,17 +64,13 @@ CASES = {
     "force, 1 s": Case(force=1000.0),
     "wheelbase + 5 %": Case(car=(("front_length", 1.05), ("rear_length", 1.05))),
 }
-SHARED = {"mass": 1500.0, "front_length": 1.2, "rear_length": 1.5}
-CARS = {
-    "dynamic": SHARED | {"front_stiffness": 9.0e4, "rear_stiffness": 1.05e5},
-    "kinematic": SHARED | {"front_stiffness": 6.0e4, "rear_stiffness": 7.0e4},
-}
 
 
-def changed_car(name, case):
+def changed_car(loaded, case):
     """The car of a case."""
-    changes = {key: factor * CARS[name][key] for key, factor in case.car}
-    car = getattr(plants, name)(**changes)
+    usual = loaded.settings["vehicle"]
+    changes = {key: factor * usual[key] for key, factor in case.car}
+    car = getattr(plants, usual["name"])(**changes)
 
     def step(state, command, env):
         return car.step(state, command.at[0].add(case.steering), env)
@@ -84,19 +78,13 @@ def changed_car(name, case):
     return car._replace(step=step) if case.steering else car
 
 
-def roads(plant, case, count, seconds, seed):
+def roads(plant, case, given):
     """Scenarios whose `observed_envs` lack what nobody measures, and keys."""
     # Where friction is reported wrong an accident is rare: half as many episodes more.
-    count = 3 * count // 2 if case.friction else count
-    family = scenarios.scenario(
-        name=case.scenario,
-        speed=case.speed,
-        duration=seconds,
-        state_size=len(plant.state_names),
-        dt=plant.dt,
-    )
-    road_key, drive_key, force_key = jax.random.split(jax.random.key(seed), 3)
-    made = jax.jit(jax.vmap(family))(jax.random.split(road_key, count))
+    count = 3 * given.episodes // 2 if case.friction else given.episodes
+    sample = family(plant, case.scenario, given.seconds, speed=case.speed)
+    road_key, drive_key, force_key = jax.random.split(jax.random.key(given.seed), 3)
+    made = jax.jit(jax.vmap(sample))(jax.random.split(road_key, count))
 
     def disturbed(key, envs):
         forces = random_side_forces(
@@ -115,65 +103,46 @@ def roads(plant, case, count, seconds, seed):
     return made, jax.random.split(drive_key, count)
 
 
-class Rows(NamedTuple):
-    """A shipped policy and the car that it was trained on."""
-
-    loaded: policy.Policy
-    plant: plants.Vehicle
-
-    @property
-    def box(self):
-        """Of the environment."""
-        about = self.loaded.settings["environment"]
-        return {f"env_{side}": tuple(about[side]) for side in ("low", "high")}
-
-    def planner(self, model, *, bounded=True):
-        """The policy's own planner with another model, without a shield."""
-        settings = dict(self.loaded.settings["controller"], shield=False)
-        box = self.box if bounded else {}
-        return build.build_controller(
-            settings, model, self.plant, law=self.loaded.law, **box
-        )
-
-    def adaptive(self, model, *, estimate_env=False, **tube):
-        """The same planner, adapting, with settings of its online tube."""
-        settings = dict(self.loaded.settings["controller"], shield=False)
+def planner(loaded, model, *, bounded=True, adaptive=False, source="measured", **tube):
+    """The policy's own planner with another model, without a shield."""
+    settings = dict(loaded.settings["controller"], shield=False)
+    if tube:
         settings["online_tube"] = dict(settings.get("online_tube") or {}, **tube)
-        return build.build_controller(
-            settings,
-            model,
-            self.plant,
-            law=self.loaded.law,
-            env_source="estimated" if estimate_env else "measured",
-            adaptive=True,
-            **self.box,
-        )
-
-    def oracle(self, car):
-        """A car's own step as a model."""
-        return build.reference_systems(car, self.loaded.law)["oracle"].model
+    ends = loaded.settings["environment"] if bounded else {}
+    return build.build_controller(
+        settings,
+        model,
+        loaded.vehicle,
+        law=loaded.law,
+        env_source=source,
+        adaptive=adaptive,
+        **{f"env_{side}": tuple(ends[side]) for side in ("low", "high") if ends},
+    )
 
 
-def systems(rows, case, car):
+def systems(loaded, case, car):
     """Row -> (controller, parameters, whether it observes what nobody measures)."""
-    model, own = rows.loaded.model, rows.loaded.params
-    adapting = partial(rows.adaptive, model, estimate_env=case.estimate_env)
-    knows = rows.planner(rows.oracle(car), bounded=False)
+    model, own = loaded.model, loaded.params
+    # Systems that know a car have its own step as their model.
+    oracle, unknowing = (
+        build.reference_systems(one, loaded.law)["oracle"].model
+        for one in (car, loaded.vehicle)
+    )
+    source = "estimated" if case.estimate_env else "measured"
+    adapting = partial(planner, loaded, adaptive=True, source=source)
     made = {
-        "oracle that knows": (knows, {}, True),
-        "SFKD": (rows.planner(model), own, False),
-        "SFKD, adaptive": (adapting(lane=None), own, False),
+        "oracle that knows": (planner(loaded, oracle, bounded=False), {}, True),
+        "SFKD": (planner(loaded, model), own, False),
+        "SFKD, adaptive": (adapting(model, lane=None), own, False),
     }
     if not (case.car or case.steering):
-        made["SFKD, adaptive, slower"] = (adapting(), own, False)
+        made["SFKD, adaptive, slower"] = (adapting(model), own, False)
     if case.friction or case == CASES["nothing, S3"]:
-        made["SFKD, adaptive, cautious"] = (adapting(grip=GRIP), own, False)
+        made["SFKD, adaptive, cautious"] = (adapting(model, grip=GRIP), own, False)
     if case.force:
-        unknowing = rows.planner(rows.oracle(rows.plant))
-        made["oracle that does not know"] = (unknowing, {}, False)
+        made["oracle that does not know"] = (planner(loaded, unknowing), {}, False)
     if case.estimate_env:
-        best = rows.adaptive(rows.oracle(rows.plant), estimate_env=True, lane=None)
-        made["oracle, e estimated"] = (best, {}, False)
+        made["oracle, e estimated"] = (adapting(unknowing, lane=None), {}, False)
     return made
 
 
@@ -192,28 +161,15 @@ def drive(car, system, scene):
     if knows:
         made = made._replace(observed_envs=made.envs)
 
-    def one(road, key):
-        return evaluation.simulate(
-            car.step,
-            controller,
-            params,
-            road,
-            key,
-            dt=car.dt,
-            horizon=HORIZON,
-            observation_noise=NOISE,
-            record={"missed": missed},
-        )
-
+    one = driving(car.step, controller, params, record={"missed": missed})
     episodes = jax.jit(jax.vmap(one))(made, keys)
     lateral = np.asarray(episodes.lateral, dtype=np.float64)
     largest = np.abs(lateral).max(axis=1)
     margin = metrics.LANE_HALF_WIDTH - metrics.VEHICLE_HALF_WIDTH
-    errors = 1e3 * np.sqrt(np.mean(lateral[:, SETTLED:] ** 2, axis=1))
     result = {
         "left_the_lane": int(np.sum(~(largest <= margin))),
         "largest_mm": round(1e3 * float(largest.max()), 1),
-        "rmse_mm": np.round(errors, 3).tolist(),
+        "rmse_mm": np.round(rmse_mm(lateral[:, SETTLED:]), 3).tolist(),
     }
     left, known = np.moveaxis(np.asarray(episodes.signals["missed"]), 2, 0)
     if known.any():
@@ -225,32 +181,30 @@ def drive(car, system, scene):
 
 def main():
     """Drive and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    out, protocol = Path(__file__).with_suffix(".json"), ("episodes", "seconds", "seed")
+    given, rows = (
+        arguments(
+            __doc__,
+            cars=CARS,
+            cases=CASES,
+            episodes=16,
+            seconds=30.0,
+            seed=2027,
+            out=out,
+        ),
+        [],
     )
-    parser.add_argument("--cars", nargs="*", choices=CARS, default=list(CARS))
-    parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
-    parser.add_argument("--episodes", type=int, default=16)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--seed", type=int, default=2027)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    given, lines = parser.parse_args(), []
-    shipped = Path(policy.__file__).parent / "pretrained"
     for name in given.cars:
-        loaded = policy.load(shipped / f"{name}_path")
-        rows = Rows(loaded, loaded.vehicle)
+        loaded = policy.load(SHIPPED / f"{name}_path")
         for label in given.cases:
             case = CASES[label]
-            car = changed_car(name, case)
-            scene = roads(car, case, given.episodes, given.seconds, given.seed)
-            for row, system in systems(rows, case, car).items():
+            car = changed_car(loaded, case)
+            scene = roads(car, case, given)
+            for row, system in systems(loaded, case, car).items():
                 about = {"car": name, "case": label, "row": row}
-                lines.append(json.dumps(about | drive(car, system, scene)))
-                print(lines[-1], flush=True)
-    protocol = {key: getattr(given, key) for key in ("episodes", "seconds", "seed")}
-    body = ",\n  ".join(lines)
-    text = f'{json.dumps(protocol)[:-1]}, "rows": [\n  {body}\n]}}\n'
-    given.out.write_text(text, "utf-8")
+                rows.append(about | drive(car, system, scene))
+                print(json.dumps(rows[-1]), flush=True)
+    write(given.out, {key: getattr(given, key) for key in protocol}, rows)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]: 
 simulated at once, with the share that stays in the certified corridor.
 """
 
-import argparse
 import json
 import time
 from functools import partial
@@ -16,136 +15,131 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from sfkd_jax import evaluation, policy, scenarios
+from benchmarks import arguments
+from sfkd_jax import evaluation, scenarios
 
-PRETRAINED = Path(sfkd_jax.__file__).with_name("pretrained")
-HORIZON = 20
+SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
+CARS = ("dynamic", "kinematic")
+NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+HORIZON, SETTLED, PERIOD = 20, 20, 0.1
+"""Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
 
 
-def loaded(name: str, samples: int, **changes):
-    """The shipped policy with another number of samples, and other settings."""
-    directory = PRETRAINED / name
-    trained = policy.restore(directory)
-    settings = trained.settings["controller"]
+def loaded(name, samples, **changes):
+    """The shipped policy along a path with another number of samples, and settings."""
+    directory = SHIPPED / f"{name}_path"
+    settings = sfkd_jax.load(directory).settings["controller"]
     mppi = settings["mppi"] | {"num_samples": samples}
-    return trained, sfkd_jax.load(
-        directory, controller=settings | {"mppi": mppi} | changes
-    )
+    return sfkd_jax.load(directory, controller=settings | {"mppi": mppi} | changes)
 
 
-def family(trained: policy.TrainedModel, duration: float):
-    """S3 for the vehicle of a policy."""
-    plant = trained.vehicle
-    states = len(plant.state_names)
-    return scenarios.scenario(
-        name="s3", duration=duration, state_size=states, dt=plant.dt
-    )
+def family(plant, name, duration, **options):
+    """A scenario for a vehicle."""
+    about = {"state_size": len(plant.state_names), "dt": plant.dt}
+    return scenarios.scenario(name=name, duration=duration, **about, **options)
 
 
-def control_step(name: str, samples: int, steps: int, **changes) -> dict[str, float]:
+def driving(step, controller, params, **options):
+    """(scenario, key) -> an episode, through the sensors."""
+    options = {"dt": PERIOD, "horizon": HORIZON, "observation_noise": NOISE} | options
+    return partial(evaluation.simulate, step, controller, params, **options)
+
+
+def fresh_episodes(policy, scenario, duration):
+    """(keys) -> distances from the path of episodes on roads of their own."""
+    sample = family(policy.vehicle, scenario, duration)
+    drive = driving(policy.vehicle.step, policy.controller, policy.params)
+
+    def one(key):
+        road_key, run_key = jax.random.split(key)
+        return drive(sample(road_key), run_key).lateral
+
+    return jax.jit(jax.vmap(one))
+
+
+def rmse_mm(lateral):
+    """Lateral RMSE of every episode [mm]."""
+    lateral = np.asarray(lateral, np.float64)
+    return 1e3 * np.sqrt(np.mean(lateral**2, axis=1))
+
+
+def control_step(name, samples, steps, **changes):
     """Wall time of one control step, transfers of state and control included."""
-    trained, loaded_policy = loaded(name, samples, **changes)
-    episode = jax.jit(family(trained, 10.0))(jax.random.key(0))
-    start, dt = jnp.zeros(()), trained.vehicle.dt
+    policy = loaded(name, samples, **changes)
+    episode = jax.jit(family(policy.vehicle, "s3", 10.0))(jax.random.key(0))
     reference = scenarios.reference_window(
-        episode.path, start, episode.speed, dt=dt, horizon=HORIZON
+        episode.path,
+        jnp.zeros(()),
+        episode.speed,
+        dt=policy.vehicle.dt,
+        horizon=HORIZON,
     )
-    act = jax.jit(loaded_policy.controller.act)
-    memory = loaded_policy.controller.init(jax.random.key(0))
-    x, e = np.asarray(episode.initial_state), np.asarray(episode.envs[0])
-    reference = np.asarray(reference)
-    times = []
-    began = time.perf_counter()
-    for step in range(steps + 5):
+    act = jax.jit(policy.controller.act)
+    memory = policy.controller.init(jax.random.key(0))
+    seen = map(np.asarray, (episode.initial_state, episode.envs[0], reference))
+    seen, times = tuple(seen), []
+    for _ in range(steps + 5):
         start = time.perf_counter()
-        control, memory, _ = act(loaded_policy.params, memory, x, e, reference)
+        control, memory, _ = act(policy.params, memory, *seen)
         np.asarray(control)
-        if step == 0:
-            compiled = time.perf_counter() - began
-        if step >= 5:
-            times.append(1e3 * (time.perf_counter() - start))
+        times.append(1e3 * (time.perf_counter() - start))
     return {
-        "median_ms": float(np.median(times)),
-        "p99_ms": float(np.quantile(times, 0.99)),
-        "first_s": compiled,
+        "median_ms": float(np.median(times[5:])),
+        "p99_ms": float(np.quantile(times[5:], 0.99)),
+        "first_s": 1e-3 * times[0],
         "compilations": act._cache_size(),
     }
 
 
-def episodes(name: str, samples: int, count: int, seed: int) -> dict[str, float]:
+def episodes(name, samples, count, seed):
     """One-minute episodes of S3, all at once."""
-    trained, loaded_policy = loaded(name, samples)
-    sample, plant = family(trained, 60.0), trained.vehicle
-    run = partial(evaluation.simulate, plant.step, loaded_policy.controller)
-
-    def one(key):
-        road_key, run_key = jax.random.split(key)
-        noise = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-        episode = run(
-            loaded_policy.params,
-            sample(road_key),
-            run_key,
-            dt=plant.dt,
-            horizon=HORIZON,
-            observation_noise=noise,
-        )
-        return jnp.max(jnp.abs(episode.lateral)), jnp.mean(episode.lateral[20:] ** 2)
-
-    many = jax.jit(jax.vmap(one))
+    policy, seconds = loaded(name, samples), []
+    many = fresh_episodes(policy, "s3", 60.0)
     keys = jax.random.split(jax.random.key(seed), count)
-    began = time.perf_counter()
-    jax.block_until_ready(many(keys))
-    first = time.perf_counter() - began
-    began = time.perf_counter()
-    largest, squared = jax.block_until_ready(many(keys))
-    seconds = time.perf_counter() - began
-    width = (loaded_policy.certificate or {}).get("corridor", {}).get("corridor_m")
-    result = {
+    for _ in range(2):
+        began = time.perf_counter()
+        lateral = np.abs(many(keys))
+        seconds.append(time.perf_counter() - began)
+    largest = lateral.max(axis=1)
+    width = policy.certificate["corridor"]["corridor_m"]
+    return {
         "episodes": count,
-        "seconds": seconds,
-        "first_s": first,
-        "steps_per_s": count * 600 / seconds,
-        "rmse_mm": float(1e3 * np.sqrt(np.mean(squared))),
-        "largest_m": float(np.max(largest)),
+        "seconds": seconds[1],
+        "first_s": seconds[0],
+        "steps_per_s": count * 600 / seconds[1],
+        "rmse_mm": float(1e3 * np.sqrt(np.mean(lateral[:, SETTLED:] ** 2))),
+        "largest_m": float(largest.max()),
+        "corridor_m": width,
+        "inside": float(np.mean(largest <= width)),
     }
-    if width:
-        result |= {"corridor_m": width, "inside": float(np.mean(largest <= width))}
-    return result
 
 
-def main() -> None:
+def main():
     """Measure, print and store."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, nargs="+", default=[1500])
-    parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--episodes", type=int, default=16)
-    parser.add_argument("--seed", type=int, default=2026)
-    parser.add_argument(
-        "--policies", nargs="+", default=["dynamic_path", "kinematic_path"]
+    asked = arguments(
+        __doc__,
+        cars=CARS,
+        samples=[1500],
+        steps=200,
+        episodes=16,
+        seed=2026,
+        out=Path(__file__).with_suffix(".json"),
     )
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    device = jax.devices()[0].device_kind
-    policies = {}
-    for name in asked.policies:
+    device, policies = jax.devices()[0].device_kind, {}
+    for name in asked.cars:
         steps = {
             str(samples): control_step(name, samples, asked.steps)
             for samples in asked.samples
         }
-        policies[name] = {"control_step": steps}
-        print(name, json.dumps(steps), flush=True)
+        policies[f"{name}_path"] = found = {"control_step": steps}
         if asked.episodes:
-            found = episodes(name, asked.samples[0], asked.episodes, asked.seed)
-            policies[name]["s3"] = found
-            print(name, json.dumps(found), flush=True)
-    if asked.out:
-        # One file for all devices: the others' measurements stay.
-        known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
-        known.setdefault("devices", {})[device] = {
-            "jax": jax.__version__,
-            "policies": policies,
-        }
-        asked.out.write_text(json.dumps(known, indent=1) + "\n")
+            found["s3"] = episodes(name, asked.samples[0], asked.episodes, asked.seed)
+        print(name, json.dumps(found), flush=True)
+    # One file for all devices: the others' measurements stay.
+    known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+    measured = {"jax": jax.__version__, "policies": policies}
+    known.setdefault("devices", {})[device] = measured
+    asked.out.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":

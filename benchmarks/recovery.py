@@ -8,31 +8,27 @@ a request inside its guard, the same request without one. Writes benchmarks/reco
 one line a row.
 """
 
-import argparse
-import json
 import time
+from collections import namedtuple
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-import sfkd_jax
-from benchmarks import device
+from benchmarks import arguments, device, write
+from benchmarks.device import CARS, HORIZON, NOISE, PERIOD
+from benchmarks.device import SHIPPED as SHIPPED
 from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
 
-SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
-CARS = ("dynamic", "kinematic")
-NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-HORIZON, SPACING, PERIOD, TICK = 20, 0.5, 0.1, 0.02
-"""Steps of a plan; of path points [m]; of the policies; of the cars between calls [s]."""
+SPACING, TICK = 0.5, 0.02
+"""Of path points [m]; of the cars between calls [s]."""
 PART, PAST, NEAR, LONGEST = 50, 51, 100, 600
 """Steps of a compiled part; readings kept; path points searched to each side; steps of
 the roads.
@@ -47,60 +43,28 @@ without recovery; not a number; full lock.
 """
 
 
-class Now(NamedTuple):
-    """What a run meets at every call; arrays begin (run, time).
-
-    Attributes:
-        env: that the car is in.
-        told: that the controller is told.
-        speed: v_ref [m/s].
-        aside: the reference, moved to the left [m].
-        steering: added to the steering angle [rad].
-        offset: of the measured pose: ahead, to the left [m], yaw [rad].
-        body: of the measured body state.
-        changed: whether the car is heavier by 30 %, or its tyres 30 % softer (2).
-        lag: calls since the reading that the sensor shows.
-        lost: whether it shows NaN.
-        kind: of the request, index of `KINDS`.
-        nu: as a share of its limit.
-    """
-
-    env: Any
-    told: Any
-    speed: Any
-    aside: Any
-    steering: Any
-    offset: Any
-    body: Any
-    changed: Any
-    lag: Any
-    lost: Any
-    kind: Any
-    nu: Any
-
-
-class Runs(NamedTuple):
-    """Runs of one length; arrays begin with the run.
-
-    Attributes:
-        start: state.
-        foot: arc length beside it [m].
-        road: points of the path.
-        noise: standard deviations of the readings.
-        ticks: `TICK`s between calls.
-        elapsed: periods between calls, as told to the planner.
-        seed: of noise and samples.
-        now: of every call.
-    """
-
-    start: Any
-    foot: Any
-    road: Any
-    noise: Any
-    ticks: Any
-    elapsed: Any
-    seed: Any
-    now: Now
+REAL, WHOLE = np.float32, np.int32
+CALL = {
+    "env": ((2,), REAL),  # that the car is in
+    "told": ((2,), REAL),  # that the controller is told
+    "speed": ((), REAL),  # v_ref [m/s]
+    "aside": ((), REAL),  # the reference, moved to the left [m]
+    "steering": ((), REAL),  # added to the steering angle [rad]
+    "offset": ((3,), REAL),  # of the measured pose: ahead, to the left [m], yaw [rad]
+    "body": (None, REAL),  # of the measured body state, which differs between cars
+    "changed": ((), WHOLE),  # 1: a car heavier by 30 %; 2: tyres 30 % softer
+    "lag": ((), WHOLE),  # calls since the reading that the sensor shows
+    "lost": ((), bool),  # whether it shows NaN
+    "kind": ((), WHOLE),  # of the request, index of `KINDS`
+    "nu": ((2,), REAL),  # as a share of its limit
+}
+"""What a run meets at every call: shape and type; arrays begin (run, time)."""
+Now = namedtuple("Now", CALL)
+Runs = namedtuple("Runs", "start foot road ticks elapsed seed now")
+"""Runs of one length; arrays begin with the run: state and arc length [m] at the start,
+points of the path, `TICK`s between calls, periods between them as told to the planner,
+seed of noise and samples, and what every call meets.
+"""
 
 
 def request(law, low, high, now):
@@ -135,10 +99,7 @@ class Car:
     """A shipped policy, its true car, and three programs that drive it."""
 
     def __init__(self, name, samples, batch):
-        directory = SHIPPED / f"{name}_path"
-        planner = sfkd_jax.load(directory).settings["controller"]
-        mppi = planner["mppi"] | {"num_samples": samples}
-        self.loaded = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
+        self.loaded = device.loaded(name, samples)
         self.name, self.batch = name, batch
         make, about = getattr(plants, name), self.loaded.settings["vehicle"]
         soft = {f"{end}_stiffness": 0.7 for end in ("front", "rear")}
@@ -222,7 +183,7 @@ def part_of_run(car, make, runs, carry):
         normals = jnp.stack([-jnp.sin(ahead[:, 2]), jnp.cos(ahead[:, 2])], axis=1)
         ahead = ahead.at[:, :2].add(now.aside * normals)
         fresh = jax.random.normal(jax.random.fold_in(key, number), state.shape)
-        past = jnp.concatenate([(state + runs.noise * fresh)[None], past[:-1]])
+        past = jnp.concatenate([(state + car.noise * fresh)[None], past[:-1]])
         shift = geometry.rotate(yaw, now.offset[:2])
         wrong = jnp.concatenate([shift, now.offset[2:], now.body])
         seen = past[now.lag] + wrong
@@ -286,16 +247,13 @@ def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
     at = np.floor(np.arange(steps) * ticks * TICK / PERIOD + 1e-6).astype(int)
     given = {"speed": 10.0, "env": envs[:, np.minimum(at, LONGEST - 1)]} | now
     given = {"told": given["env"]} | given
-    shapes = dict.fromkeys(("nu", "env", "told"), (2,))
-    shapes |= {"offset": (3,), "body": (car.states - 3,)}
-    kinds = dict.fromkeys(("lag", "kind", "changed"), np.int32) | {"lost": bool}
     filled = Now(
         *(
             np.broadcast_to(
-                np.asarray(given.get(name, 0), kinds.get(name, np.float32)),
-                (count, steps, *shapes.get(name, ())),
+                np.asarray(given.get(name, 0), kind),
+                (count, steps, *((car.states - 3,) if shape is None else shape)),
             )
-            for name in Now._fields
+            for name, (shape, kind) in CALL.items()
         )
     )
     every = partial(np.full, count)
@@ -312,7 +270,6 @@ def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
         start=start,
         foot=foot,
         road=points.astype(np.float32),
-        noise=np.tile(car.noise, (count, 1)),
         ticks=every(ticks, np.int32),
         elapsed=every(ticks * TICK / PERIOD, np.float32),
         seed=np.arange(count) + 1000 * seed,
@@ -718,9 +675,7 @@ def cost_rows(car, most):
     """A call with the guard and without it."""
     samples = car.loaded.settings["controller"]["mppi"]["num_samples"]
     for way in (True, False):
-        step = device.control_step(
-            f"{car.name}_path", samples, min(most, 300), shield=way
-        )
+        step = device.control_step(car.name, samples, min(most, 300), shield=way)
         yield f"a call {'in the guard' if way else 'without it'}", step
 
 
@@ -738,29 +693,25 @@ ROWS = {
 
 def main():
     """Drive, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    given = arguments(
+        __doc__,
+        cars=CARS,
+        rows=ROWS,
+        runs=10_000,
+        samples=1500,
+        batch=16 if jax.default_backend() == "cpu" else 512,
+        out=Path(__file__).with_suffix(".json"),
     )
-    parser.add_argument("--cars", nargs="*", choices=CARS, default=CARS)
-    parser.add_argument("--rows", nargs="*", choices=ROWS, default=[*ROWS])
-    parser.add_argument("--runs", type=int, default=10_000, help="of a row, at most")
-    parser.add_argument("--samples", type=int, default=1500)
-    at_once = 16 if jax.default_backend() == "cpu" else 512
-    parser.add_argument("--batch", type=int, default=at_once, help="runs at once")
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    given, lines, began = parser.parse_args(), [], time.perf_counter()
     head = {"samples": given.samples, "device": jax.devices()[0].device_kind}
-    for name, group in product(given.cars, given.rows):
-        if group == given.rows[0]:
-            car = Car(name, given.samples, given.batch)
-        for label, found in ROWS[group](car, given.runs):
-            row = {"car": name, "row": label} | found
-            lines.append(json.dumps(row, ensure_ascii=False, separators=(",", ":")))
-            print(f"{time.perf_counter() - began:6.1f} s", lines[-1], flush=True)
-        # After every group: a run that is cut off has what it measured.
-        body = ",\n".join(lines)
-        text = f'{json.dumps(head)[:-1]}, "rows": [\n{body}\n]}}\n'
-        given.out.write_text(text, "utf-8")
+    rows, began = [], time.perf_counter()
+    for name in given.cars:
+        car = Car(name, given.samples, given.batch)
+        for group in given.rows:
+            for label, found in ROWS[group](car, given.runs):
+                rows.append({"car": name, "row": label} | found)
+                print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)
+            # After every group: a run that is cut off has what it measured.
+            write(given.out, head, rows)
 
 
 if __name__ == "__main__":

@@ -8,19 +8,20 @@ own, in turn; a library that does not import is named and left out. Writes
 benchmarks/timing.json.
 """
 
-import argparse
 import json
 import os
 import platform
 import statistics
-import subprocess
-import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib import metadata
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+
+from benchmarks import arguments
 
 HOME = Path(__file__).parent
 RANK, CONTROLS, OUTPUTS, WIDTH = 32, 2, 4, 64
@@ -264,41 +265,24 @@ def measure(name, steps):
 
 
 def in_own_process(name, steps):
-    """`measure` in a new process; {"error": its last line} if it fails."""
-    command = [sys.executable, "-m", "benchmarks.timing", "--measure", name]
-    command += ["--steps", str(steps)]
-    done = subprocess.run(
-        command, cwd=HOME.parent, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        return {"error": (done.stderr.strip().splitlines() or ["no output"])[-1]}
-    return json.loads(done.stdout.splitlines()[-1])
+    """`measure` in a new process; {"error": what it says} if it fails."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        try:
+            return pool.submit(measure, name, steps).result()
+        except Exception as error:
+            return {"error": repr(error)}
 
 
 def versions():
     """Of the packages that are installed."""
-    found = {}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
+    found = {one.name.replace("-", "_"): one for one in metadata.distributions()}
+    return {name: found[name].version for name in PACKAGES if name in found}
 
 
 def main():
     """Parse, run, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--only", nargs="*", default=[*CONTENDERS], choices=CONTENDERS)
-    parser.add_argument("--measure", choices=CONTENDERS, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.measure:
-        print(json.dumps(measure(given.measure, given.steps)))
-        return
+    out = HOME / "timing.json"
+    given = arguments(__doc__, rounds=3, steps=40, only=CONTENDERS, out=out)
     # Another job beside a benchmark spoils its times: the load says whether there was.
     load, rounds = os.getloadavg()[0], {name: [] for name in given.only}
     for _ in range(given.rounds):
@@ -330,7 +314,7 @@ def main():
         "left_out": left_out,
         "rows": rows,
     }
-    (HOME / "timing.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+    given.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

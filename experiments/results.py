@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from benchmarks import write
 from sfkd_jax import evaluation
 from sfkd_jax.report import figures, style
 
@@ -102,15 +103,6 @@ def _row(row):
             for one in row["disturbed"]
         ]
     return kept
-
-
-def write(name, document):
-    """One line a row, so that a change of one row is a change of one line."""
-    rows = ",\n".join(f"  {json.dumps(row)}" for row in document["rows"])
-    head = json.dumps({key: document[key] for key in document if key != "rows"})
-    (HOME / f"{name}.json").write_text(
-        f'{head[:-1]}, "rows": [\n{rows}\n]}}\n', "utf-8"
-    )
 
 
 def read(name):
@@ -222,7 +214,8 @@ def main():
     given = parser.parse_args()
     folder = HOME.parent / "runs" / (given.run or given.name)
     results = json.loads((folder / "results.json").read_text("utf-8"))
-    write(given.name, condense(results))
+    document = condense(results)
+    write(HOME / f"{given.name}.json", document, document.pop("rows"))
 
 
 if __name__ == "__main__":
