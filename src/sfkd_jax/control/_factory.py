@@ -1,15 +1,26 @@
-"""A factory with the arguments of a dataclass, so that they are stated once."""
+"""Dataclasses as controllers, and factories with their arguments, stated once."""
 
 from __future__ import annotations
 
 import functools
 import typing
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
+
+from sfkd_jax.types import Controller
 
 P = ParamSpec("P")
 S = TypeVar("S")
 R = TypeVar("R")
+
+
+class Stateful:
+    """Settings whose `init` and `act` are those of a controller."""
+
+    def controller(self) -> Controller:
+        """Return the controller, as two functions."""
+        own: Any = self
+        return Controller(own.init, own.act)
 
 
 def factory(settings: Callable[P, S], make: Callable[[S], R]) -> Callable[P, R]:

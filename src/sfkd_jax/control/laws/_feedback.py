@@ -123,7 +123,7 @@ class RecoveringFeedback(LinearFeedback):
         # From lock to lock and more, but at rest none.
         room = jnp.pi * moving(errors.speed + speed, speed)
         steering = jnp.clip(steering, ahead - room, ahead + room)
-        return jnp.stack([steering, drive - holding(errors, speed)])
+        return jnp.stack([steering, drive - holding(errors.speed + speed, speed)])
 
     def authority(self, errors: PathErrors, speed: Scalar) -> Scalar:
         """Return the share of a perturbation that acts, see `SteadyTurn`."""
@@ -276,5 +276,5 @@ class ModelLaw(NamedTuple):
         """
         errors = path_errors(state, point, curvature)
         xi = jnp.concatenate([jnp.stack(errors[:2]), state[BODY]])
-        control = turn.feedback(xi).at[1].add(-holding(errors, point[3]))
+        control = turn.feedback(xi).at[1].add(-holding(state[3], point[3]))
         return control, turn.authority(xi)

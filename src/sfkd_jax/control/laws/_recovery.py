@@ -196,13 +196,13 @@ def admitted(nu: Control, actual: Scalar, speed: Scalar) -> Control:
     return jnp.where(speed == 0.0, nu.at[1].min(0.0), nu)
 
 
-def holding(errors: PathErrors, speed: Scalar) -> Scalar:
+def holding(actual: Scalar, speed: Scalar) -> Scalar:
     """Return what brakes a car to standstill, and keeps it there [m/s²].
 
     0 unless the reference stands. Proportional up to 0.1 m/s: a vehicle that can
     reverse does not.
     """
-    brake = HOLDING * jnp.clip(10.0 * (errors.speed + speed), -1.0, 1.0)
+    brake = HOLDING * jnp.clip(10.0 * actual, -1.0, 1.0)
     return jnp.where(speed == 0.0, brake, 0.0)
 
 

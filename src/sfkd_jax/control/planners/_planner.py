@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
+from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
 from sfkd_jax.ranges import AtLeastOne, Positive
-from sfkd_jax.types import Control, Controller, ControllerInfo, Key, Params, Scalar
+from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
@@ -121,7 +122,7 @@ class SearchResult(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Planner:
+class Planner(Stateful):
     """The receding-horizon controller of a task; a subclass searches for its best plan.
 
     Values that are not finite never enter the plan. If all rollouts are not finite, or
@@ -176,10 +177,6 @@ class Planner:
             evaluate: rolls out plans of shape (horizon, sample, control).
         """
         raise NotImplementedError
-
-    def controller(self) -> Controller:
-        """Return the planner as two functions."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> PlannerState:
         """Return the state before the first step: a plan of zeros, the law alone.

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control._factory import factory
+from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control.laws._feedback import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.laws._recovery import SteadyTurn
@@ -86,7 +86,7 @@ class AlongReferenceState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class AlongReference:
+class AlongReference(Stateful):
     """A controller in the world from one along a path.
 
     The only place where a state is projected, once per control step. Predicted states
@@ -103,10 +103,6 @@ class AlongReference:
     inner: Controller
     _: KW_ONLY
     coordinates: int
-
-    def controller(self) -> Controller:
-        """Return the controller of poses in the world."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> AlongReferenceState:
         """Return the state before the first control step."""

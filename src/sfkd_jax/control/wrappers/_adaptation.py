@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._estimator import (
@@ -25,6 +26,7 @@ from sfkd_jax.control.wrappers._estimator import (
     side_force,
     transition_matrix,
 )
+from sfkd_jax.control.wrappers._innovations import expected_coordinates
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.ranges import (
     AtLeastTwo,
@@ -35,7 +37,6 @@ from sfkd_jax.ranges import (
 )
 from sfkd_jax.rollout import Offset, fold
 from sfkd_jax.types import (
-    BODY,
     Control,
     Controller,
     ControllerInfo,
@@ -65,7 +66,7 @@ class AdaptiveState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adaptation:
+class Adaptation(Stateful):
     """A controller along a path with estimates of what nobody measures.
 
     The unmeasured causes are a side force f (relative to the largest of E), an error of
@@ -169,10 +170,6 @@ class Adaptation:
         # The position's two entries become the one of e_y.
         sensors = (self.sensor_noise[0], *self.sensor_noise[2:])
         return sensors[:size], self.model_error[:size]
-
-    def controller(self) -> Controller:
-        """Return the controller along a path."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> AdaptiveState:
         """Return the state before the first control step."""
@@ -294,9 +291,7 @@ def _compensation(
     shifted = excess * loop.force_slope(params, applied, coordinates)
 
     def advance(xi: PathState, nu: Control) -> PathState:
-        latent = model.encode(fiber, path_state(xi))
-        after = model.step(fiber, latent, jnp.concatenate([nu, road]))
-        return model.decode(fiber, after)[BODY]
+        return expected_coordinates(model, fiber, xi, nu, road)
 
     A, B = jax.jacfwd(advance, (0, 1))(coordinates, jnp.zeros(2))
     # Unknown are steering and drive in place of e_y and v, which stay at 0.

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.control._factory import factory
+from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.ranges import AtLeastOne, check_intervals
 from sfkd_jax.types import (
     Control,
@@ -36,7 +36,7 @@ class DelayState(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class DelayCompensation:
+class DelayCompensation(Stateful):
     """A controller for actuators that respond `delay` sampling periods late.
 
         x̂_{k+d} = F(… F(x_k, u_{k−d}, e_k) …, u_{k−1}, e_k)
@@ -50,7 +50,6 @@ class DelayCompensation:
         inner: any controller.
         model: used for the prediction; usually that of the controller's rollouts.
         delay: d, at least 1.
-        initial_control: in force before the first control arrives.
 
     Raises:
         ValueError: the delay is less than 1, or the model is in path coordinates.
@@ -60,7 +59,6 @@ class DelayCompensation:
     model: Model
     _: KW_ONLY
     delay: AtLeastOne
-    initial_control: tuple[float, ...] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -71,14 +69,9 @@ class DelayCompensation:
                 "model its closed loop along a path: use models.physics(plant.step)"
             )
 
-    def controller(self) -> Controller:
-        """Return the controller that plans from the arrival."""
-        return Controller(self.init, self.act)
-
     def init(self, key: Key) -> DelayState:
         """Return the state before the first control step."""
-        sent = jnp.asarray(self.initial_control, dtype=float)
-        return DelayState(self.inner.init(key), jnp.tile(sent, (self.delay, 1)))
+        return DelayState(self.inner.init(key), jnp.zeros((self.delay, 2)))
 
     def act(
         self,

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview, check_preview
@@ -122,7 +123,7 @@ class GateState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gate:
+class Gate(Stateful):
     """A controller along a path that follows plausible measurements only.
 
         ξ⁻ = F(ξ̂; u − law(ξ̂), κ, v_ref, e),   |ξ_i − ξ⁻_i| ≤ limit_i
@@ -181,10 +182,6 @@ class Gate:
 
     def __post_init__(self) -> None:
         check_intervals(self)
-
-    def controller(self) -> Controller:
-        """Return the controller along a path."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> GateState:
         """Return the state before the first control step."""

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.laws._recovery import PathErrors, holding
+from sfkd_jax.control.laws._recovery import holding
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._gate import ANYWHERE, Box, Conditions
@@ -158,7 +159,7 @@ class ShieldState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shield:
+class Shield(Stateful):
     """A filter around a controller that keeps a nominal model in its corridor.
 
         ν = u − law(ξ; κ_0, v_0, e),   ν' = safety_filter(ν)
@@ -254,10 +255,6 @@ class Shield:
         """Numbers of entries of ξ and of e."""
         return self.law.gain.shape[-1], self.law.low.shape[0] - 2
 
-    def controller(self) -> Controller:
-        """Return the controller along a path."""
-        return Controller(self.init, self.act)
-
     def init(self, key: Key) -> ShieldState:
         """Return the state before the first control step."""
         states, environments = self._sizes
@@ -314,9 +311,8 @@ class Shield:
         braking = usable & now.started & (planned[1] < gentlest[1] - 1e-3)
         drive = jnp.where(braking, planned[1], control[1])
         # Where the reference stands a law drives by the noise of a speed: it creeps.
-        speed, (left, turned) = road[0, 1], coordinates[:PATH_SPEED]
-        errors = PathErrors(left, turned, coordinates[PATH_SPEED] - speed)
-        still = drive - holding(errors, speed)
+        speed = road[0, 1]
+        still = drive - holding(coordinates[PATH_SPEED], speed)
         stands = now.started & (speed == 0.0)
         control = control.at[1].set(
             jnp.where(stands, jnp.clip(still, low[1], 0.0), drive)
@@ -325,13 +321,12 @@ class Shield:
         cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
         feasible = now.started & chosen.feasible
         applies = now.started & ~(flags["outside_box"] | flags["bound_exceeded"])
-        applies &= ~braking & flags["env_inside"] & preview.trusted
-        applies &= jnp.all(preview.measured)
+        known = preview.trusted & jnp.all(preview.measured)
+        applies &= ~braking & flags["env_inside"] & known
         holds = applies & feasible
         intervention = jnp.where(now.started & jnp.any(chosen.nu != request), cut, 0.0)
         corridor = self.width + self.tube + now.offset
         usual = jnp.where(holds, corridor, jnp.nan)
-        known = preview.trusted & jnp.all(preview.measured)
         rolls = self._slow(coordinates, road[0]) & known & ~holds
         corridor = jnp.where(rolls, state.rolling, usual)
         report: Any = {

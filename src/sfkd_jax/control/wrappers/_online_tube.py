@@ -9,6 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.geometry import LATERAL, between, compose, curvature_ahead, wrap_angle
 from sfkd_jax.ranges import AtLeastTwo, Fraction, Interval, Positive, check_intervals
@@ -54,7 +55,7 @@ class OnlineTubeState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnlineTube:
+class OnlineTube(Stateful):
     """A tube around the plans of a controller, and a speed at which it fits the lane.
 
     For every h up to the horizon, the plan of h steps ago said where the car would be
@@ -115,10 +116,6 @@ class OnlineTube:
 
     def __post_init__(self) -> None:
         check_intervals(self)
-
-    def controller(self) -> Controller:
-        """Return the controller in the world."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> OnlineTubeState:
         """Return the state before the first control step."""
