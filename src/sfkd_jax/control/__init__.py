@@ -5,7 +5,6 @@ from sfkd_jax.control.lanes._in_lane import InLane as InLane
 from sfkd_jax.control.lanes._in_lane import in_lane as in_lane
 from sfkd_jax.control.lanes._manoeuvre import Class as Class
 from sfkd_jax.control.lanes._manoeuvre import Manoeuvres as Manoeuvres
-from sfkd_jax.control.laws._feedback import FeedbackLaw as FeedbackLaw
 from sfkd_jax.control.laws._feedback import LinearFeedback as LinearFeedback
 from sfkd_jax.control.laws._feedback import ModelLaw as ModelLaw
 from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
@@ -36,7 +35,6 @@ from sfkd_jax.control.tasks._path_tracking import Cost as Cost
 from sfkd_jax.control.tasks._path_tracking import StageInputs as StageInputs
 from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
 from sfkd_jax.control.tasks._path_tracking import tracking_cost as tracking_cost
-from sfkd_jax.control.tasks._task import PlanningStart as PlanningStart
 from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
 from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
