@@ -61,17 +61,11 @@ def lane_along(path: Path, *, width: float = 7.0, speed: float = 10.0) -> Lane:
 def circles(
     position: Float[Array, "obstacle 2"], radius: Float[Array, " obstacle"] | float
 ) -> Obstacles:
-    """Return circles that stand still.
-
-    Args:
-        position: of the centres [m].
-        radius: of all, or of each [m].
-    """
+    """Return circles that stand still, from their centres and radii [m]."""
     position = jnp.asarray(position, dtype=float)
-    each = jnp.zeros(position.shape[0])
-    present = jnp.ones(position.shape[0], bool)
+    none = jnp.zeros(position.shape[0])
     size = jnp.zeros_like(position)
-    return Obstacles(position[:, None], each, size, each + radius, present)
+    return Obstacles(position[:, None], none, size, none + radius, none == 0.0)
 
 
 def outside_box(
@@ -103,9 +97,8 @@ def clearance(
 ) -> Float[Array, "obstacle ..."]:
     """Return how far a box is at least from each obstacle [m], negative inside.
 
-    Exact for a point and for circles; of two boxes it is the distance of one from the
-    smallest box around the other that is parallel to it, or the other way round,
-    whichever is larger. Infinite where no obstacle is present.
+    Exact for circles; of two boxes it is the distance of one from the smallest parallel
+    one around the other, the larger of both. Infinite where no obstacle is present.
 
     Args:
         obstacles: (obstacle,).
@@ -138,18 +131,14 @@ def distance(
     their_cos, their_sin = jnp.cos(obstacle.yaw), jnp.sin(obstacle.yaw)
     parallel = jnp.abs(their_cos * cos + their_sin * sin)
     across = jnp.abs(their_sin * cos - their_cos * sin)
-    ours = (
-        half[0] + length * parallel + width * across,
-        half[1] + length * across + width * parallel,
+    # Half of each box, and of the smallest one around the other that is parallel to it.
+    ours, theirs = (
+        (a + parallel * c + across * d, b + parallel * d + across * c)
+        for (a, b), (c, d) in ((half, (length, width)), ((length, width), half))
     )
-    theirs = (
-        length + half[0] * parallel + half[1] * across,
-        width + half[0] * across + half[1] * parallel,
-    )
+    turned = their_cos * x + their_sin * y, their_cos * y - their_sin * x
     nearest = jnp.maximum(
         outside_box(cos * x + sin * y, cos * y - sin * x, ours),
-        outside_box(
-            their_cos * x + their_sin * y, their_cos * y - their_sin * x, theirs
-        ),
+        outside_box(*turned, theirs),
     )
     return jnp.where(obstacle.present, nearest - obstacle.radius, jnp.inf)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
+import sfkd_jax
 from sfkd_jax import control
 from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
 from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
@@ -321,3 +322,23 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
         np.testing.assert_allclose(
             info["reference"][one], rows[number][2]["reference"], atol=2e-3
         )
+
+
+@pytest.mark.parametrize("name", ["dynamic_path", "kinematic_path"])
+def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
+    policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{name}")
+    driver, size = policy.in_lane(), len(policy.vehicle.state_names)
+    key, scene = jax.random.key(0), (road, circles(beside(road, POSTS), 0.8))
+    # Only traced: what is missing or of another shape fails here.
+    _, _, info = jax.eval_shape(
+        lambda key: driver.act(
+            policy.params, driver.init(key), jnp.zeros(size), jnp.zeros(2), scene
+        ),
+        key,
+    )
+    assert info["reference"].shape == (policy.interface["horizon"], 4)
+    assert {"clearance", "corridor", "admissible", "stopping"} <= set(info)
+    with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
+        driver.act(None, None, None, None, (road._replace(left=jnp.ones(3)), scene[1]))
+    with pytest.raises(ValueError, match="no certified corridor"):
+        sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/dynamic").in_lane()

@@ -117,15 +117,11 @@ class InLane:
     def init(self, key: Key) -> LaneState:
         """Return the state before the first control step."""
         inner, planner = jax.random.split(key)
-        committed = Committed(
-            index=jnp.zeros((), jnp.int32),
-            move=jnp.zeros((3, self.samples)),
-            square=jnp.zeros(self.samples),
-        )
+        none, rest = jnp.zeros((3, self.samples)), jnp.zeros(self.samples)
         return LaneState(
             inner=self.inner.init(inner),
             planner=self.planner.init(planner),
-            committed=committed,
+            committed=Committed(jnp.zeros((), jnp.int32), none, rest),
             progress=jnp.zeros(()),
             wait=jnp.zeros((), jnp.int32),
             started=jnp.asarray(False),
@@ -141,49 +137,39 @@ class InLane:
     ) -> tuple[Control, LaneState, ControllerInfo]:
         """Take one control step."""
         task, weights = self.manoeuvres, state.planner.tuning.cost
-        (lane, obstacles), clean = _finite(*scene)
-        progress, situation = self._situation(state, observation, env, lane, obstacles)
+        scene, clean = _finite(*scene)
+        progress, situation = self._situation(state, observation, env, scene, clean)
+        path = scene[0].path
         kept = task.judge(weights, situation, situation.committed)
-        free = ~jnp.any(kept.blocked) & clean
+        free = ~jnp.any(kept.blocked)
         # What was committed is judged at every step: what appears is seen at once.
         due = (state.wait <= 0) | ~free
         planner, committed = jax.lax.cond(
             due,
-            lambda: self._search(state.planner, situation, kept, clean),
+            lambda: self._search(state.planner, situation, kept, free),
             lambda: (state.planner, situation.committed),
         )
         judged = task.judge(weights, situation, committed)
         times = task.dt * jnp.arange(1, self.horizon + 1)
-        ahead = window(lane.path, committed, judged.curve, situation.place, times)
-        later = window(
-            lane.path, committed, judged.curve, situation.place, times + self.lead
-        )
-        ahead = ahead.at[:, 3].set(later[:, 3])
-        control, inner, info = self.inner.act(
-            params, state.inner, observation, env, ahead
-        )
+        at = partial(window, path, committed, judged.curve, situation.place)
+        ahead = at(times).at[:, 3].set(at(times + self.lead)[:, 3])
+        given = state.inner, observation, env, ahead
+        control, inner, info = self.inner.act(params, *given)
         # What was needed is the corridor of the certificate; here is that of the step.
-        room = jnp.min(judged.gap) + task.kind.corridor
-        room = room - info.get("corridor", jnp.nan)
+        excess = info.get("corridor", jnp.nan) - task.kind.corridor
+        room = jnp.min(judged.gap) - excess
         report: Any = {
             **info,
             "healthy": info["healthy"] & clean,
             "reference": ahead,
-            "offset": jnp.interp(
-                situation.place, jnp.arange(self.samples), committed.move[0]
-            ),
+            "offset": committed.move[0, BEHIND],
             "clearance": jnp.where(clean, room, jnp.nan),
-            "admissible": (judged.violation <= 0.0) & clean,
+            "admissible": judged.violation <= 0.0,
             "stopping": ~judged.curve.reached[-1],
         }
-        after = LaneState(
-            inner=inner,
-            planner=planner,
-            committed=committed,
-            progress=progress,
-            wait=jnp.where(due, self.period, state.wait) - 1,
-            started=state.started | all_finite(observation),
-        )
+        wait = jnp.where(due, self.period, state.wait) - 1
+        started = state.started | all_finite(observation)
+        after = LaneState(inner, planner, committed, progress, wait, started)
         return control, after, report
 
     def _situation(
@@ -191,11 +177,12 @@ class InLane:
         state: LaneState,
         observation: State,
         env: Environment,
-        lane: Lane,
-        obstacles: Obstacles,
+        scene: Scene,
+        clean: Bool[Array, ""],
     ) -> tuple[Scalar, Situation]:
         """Where the car is along the path [m], and what references are judged by."""
-        path, position, kind = lane.path, observation[:2], self.manoeuvres.kind
+        (lane, obstacles), kind = scene, self.manoeuvres.kind
+        path, position = lane.path, observation[:2]
         index, square = state.committed.index, state.committed.square
         known = all_finite(observation)
         guess = state.progress + self.manoeuvres.dt * jnp.sqrt(square[BEHIND])
@@ -219,22 +206,15 @@ class InLane:
         speed = jnp.maximum(observation[3], 0.0)
         begun = speed_profile(road.wanted, speed**2, path.spacing, *most)
         held = state.committed._replace(index=index).at(first, road.wanted)
-        committed = jax.tree.map(
-            partial(jnp.where, fresh), Committed(first, move, begun), held
-        )
+        begun = Committed(first, move, begun)
+        committed = jax.tree.map(partial(jnp.where, fresh), begun, held)
         friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
         friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
-        place = progress / path.spacing - first
-        return progress, Situation(
-            road, committed, obstacles, place, GRAVITY * friction
-        )
+        place, grip = progress / path.spacing - first, GRAVITY * friction
+        return progress, Situation(road, committed, obstacles, place, grip, clean)
 
     def _search(
-        self,
-        planner: Any,
-        situation: Situation,
-        kept: Judged,
-        clean: Bool[Array, ""],
+        self, planner: Any, situation: Situation, kept: Judged, free: Bool[Array, ""]
     ) -> tuple[Any, Committed]:
         """Return the state of the planner and the reference to commit."""
         task, before = self.manoeuvres, situation.committed
@@ -245,18 +225,14 @@ class InLane:
         better = info["mean_cost"] < (1.0 - self.better) * kept.cost
         better |= kept.violation > 0.0
         # A plan that continues an old one is not the one that was evaluated.
-        taken = better & info["healthy"] & info["constraints_kept"] & clean
-        stop = task.stop(situation, kept, clean)
-        stays = ~jnp.any(kept.blocked) & clean
-        otherwise = jax.tree.map(partial(jnp.where, stays), before, stop)
+        taken = better & info["healthy"] & info["constraints_kept"]
+        stop = task.stop(situation, kept)
+        otherwise = jax.tree.map(partial(jnp.where, free), before, stop)
         return after, jax.tree.map(partial(jnp.where, taken), found, otherwise)
 
 
 def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:
-    """Return a scene without NaN and infinity, and whether there was none.
-
-    Padding may hold anything.
-    """
+    """Return a finite scene, and whether it was one; padding may hold anything."""
     points, count = lane.path.points.shape[0], obstacles.position.shape[0]
     sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
     rows = {leaf.shape[0] for leaf in obstacles}
@@ -271,12 +247,9 @@ def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:
         present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(present, leaf, 0)
 
-    obstacles = Obstacles(*map(shown, obstacles))
-    clean = all_finite((lane, obstacles))
-    lane, obstacles = jax.tree.map(
-        lambda leaf: jnp.nan_to_num(leaf, posinf=0.0, neginf=0.0), (lane, obstacles)
-    )
-    return (lane, obstacles), clean
+    scene = lane, Obstacles(*map(shown, obstacles))
+    whole = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)
+    return jax.tree.map(whole, scene), all_finite(scene)
 
 
 in_lane = factory(InLane, InLane.controller)

@@ -19,8 +19,8 @@ from sfkd_jax.control.lanes._reference import (
     curve,
     speed_profile,
 )
+from sfkd_jax.control.tasks._constraints import constrained
 from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task
-from sfkd_jax.geometry import SMALLEST_SCALE
 from sfkd_jax.lanes import Obstacles, distance
 from sfkd_jax.paths import quintic
 from sfkd_jax.ranges import Fraction, NonNegative, Positive, Span, check_intervals
@@ -84,6 +84,7 @@ class Situation(NamedTuple):
         obstacles: all of them finite.
         place: of the car, in samples from the first one.
         grip: acceleration that the tyres allow [m/s²].
+        clean: whether all of the scene is finite; nothing is free in another one.
     """
 
     road: RoadAhead
@@ -91,6 +92,7 @@ class Situation(NamedTuple):
     obstacles: Obstacles
     place: Scalar
     grip: Scalar
+    clean: Bool[Array, ""]
 
 
 class Judged(NamedTuple):
@@ -156,19 +158,13 @@ class Manoeuvres:
     def task(self) -> Task:
         """Return the planning problem as functions."""
         edge = jnp.asarray([self.widest, 30.0, self.widest, 30.0, 30.0])
-        return Task(
-            -edge,
-            edge,
-            jnp.asarray(self.weights),
-            self.prepare,
-            self.step,
-            lambda *_: None,
-            constraint=lambda _, violation, *__: violation[None],
+        given = -edge, edge, jnp.asarray(self.weights), self.prepare, self.step
+        return constrained(
+            Task(*given, lambda *_: None), lambda _, violation, *__: violation[None]
         )
 
     def prepare(self, params: Params, situation: Situation, *_: Any) -> RolloutSetup:
         """Return the situation; there is one step."""
-        del params
         return RolloutSetup(situation, jnp.zeros(()), jnp.zeros(1))
 
     def step(
@@ -201,16 +197,8 @@ class Manoeuvres:
         square = jnp.concatenate([before.square[:BEHIND], square[BEHIND:]])
         return Committed(before.index, move, square)
 
-    def stop(
-        self, situation: Situation, judged: Judged, clean: Bool[Array, ""]
-    ) -> Committed:
-        """Return the committed reference with a stop before what blocks it.
-
-        Args:
-            situation: with the committed reference.
-            judged: that reference.
-            clean: whether what blocks it is known; else it stops at once.
-        """
+    def stop(self, situation: Situation, judged: Judged) -> Committed:
+        """Return the committed reference with a stop before what blocks it."""
         before, spacing = situation.committed, situation.road.spacing
         samples = jnp.arange(before.square.shape[0])
         start = before.square[BEHIND]
@@ -219,16 +207,14 @@ class Manoeuvres:
         grip = jnp.sqrt(jnp.maximum((ALMOST * situation.grip) ** 2 - bend**2, 0.01))
         grip = jnp.minimum(grip, self.kind.braking)
         gentle = jnp.minimum(self.kind.deceleration, grip)
-        until = jnp.where(clean, jnp.argmax(judged.blocked), 0)
-        until = until * spacing - self.standoff
+        until = jnp.argmax(judged.blocked) * spacing - self.standoff
         left = jnp.maximum(until - situation.place * spacing, 1e-3)
         needed = jnp.clip(0.5 * start / left, gentle, grip)
         most = 2.0 * needed * jnp.maximum(until - samples * spacing, 0.0)
         most = jnp.minimum(before.square, most)
         square = speed_profile(most, start, spacing, self.kind.acceleration, grip)
-        return before._replace(
-            square=jnp.where(samples < BEHIND, before.square, square)
-        )
+        square = jnp.where(samples < BEHIND, before.square, square)
+        return before._replace(square=square)
 
     def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
         """Return what a reference costs, how far it leaves the class, and its room."""
@@ -244,7 +230,6 @@ class Manoeuvres:
                 square**1.5 * jnp.abs(turning) / kind.jerk,
                 square * jnp.abs(curvature) / lateral,
                 square / kind.speed[1] ** 2,
-                jnp.where(along.scale < SMALLEST_SCALE, 2.0, 0.0),
             ]
         )
         # What is before the splice cannot be changed any more.
@@ -264,7 +249,7 @@ class Manoeuvres:
 
     def _room(
         self, situation: Situation, move: Float[Array, "3 sample"], along: Curve
-    ) -> list[Float[Array, " sample"]]:
+    ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
         """What obstacles and edges leave beyond what is needed [m]."""
         road, half = situation.road, self.kind.half
         samples = jnp.arange(along.times.shape[0])
@@ -282,5 +267,6 @@ class Manoeuvres:
         edge = edge - half[1] - half[0] * jnp.abs(move[1]) / along.stretch
         # The car is between two samples, and both count, also where it stands.
         counts = (along.reached | (samples == BEHIND + 1)) & (samples >= BEHIND)
-        room = gap - LATE, edge
-        return [jnp.where(counts, one - self.kind.margin, jnp.inf) for one in room]
+        gap, edge = gap - LATE - self.kind.margin, edge - self.kind.margin
+        gap = jnp.where(situation.clean, jnp.where(counts, gap, jnp.inf), -jnp.inf)
+        return gap, jnp.where(counts, edge, jnp.inf)

@@ -1,8 +1,6 @@
 """A reference beside the centre line, on the samples of the road.
 
-Offset d, its derivatives by the arc length s of the road, and the speed belong to
-samples of the road itself: as the car drives on, the arrays move by whole samples, and
-nothing is rounded.
+As the car drives on, the arrays move by whole samples, and nothing is rounded.
 """
 
 from __future__ import annotations
@@ -42,9 +40,7 @@ class Committed(NamedTuple):
     def at(self, index: Int[Array, ""], most: Float[Array, " sample"]) -> Committed:
         """Return the same reference from another sample on, its last values held.
 
-        Args:
-            index: of the first sample.
-            most: v² at its samples, which what is held keeps [m²/s²].
+        `most` is v² there, which what is held keeps [m²/s²].
         """
         count = self.square.shape[0]
         rows = jnp.arange(count) + index - self.index
@@ -88,7 +84,6 @@ class Curve(NamedTuple):
         direction: cosine and sine of its yaw, (2, sample).
         curvature: of the curve itself [1/m].
         stretch: its length per length of the road.
-        scale: 1 − κ d; below 0.2 the offset reaches the centre of the bend.
         lengths: from each sample to the next [m].
         times: when it is there, from the first sample on [s].
         reached: whether it ever is.
@@ -98,7 +93,6 @@ class Curve(NamedTuple):
     direction: Float[Array, "2 sample"]
     curvature: Float[Array, " sample"]
     stretch: Float[Array, " sample"]
-    scale: Float[Array, " sample"]
     lengths: Float[Array, " gap"]
     times: Float[Array, " sample"]
     reached: Bool[Array, " sample"]
@@ -107,28 +101,20 @@ class Curve(NamedTuple):
 def road_ahead(
     lane: Lane, index: Int[Array, ""], count: int, accelerations: tuple[float, float]
 ) -> RoadAhead:
-    """Return the samples of a lane from one on.
+    """Return the samples of a lane from one on; an open path ends at speed 0.
 
-    Beyond the end of an open path its last sample is repeated, at speed 0.
-
-    Args:
-        lane: with its path.
-        index: of the first sample.
-        count: of samples.
-        accelerations: largest, and largest deceleration [m/s²].
+    `accelerations` are the largest, and the largest deceleration [m/s²].
     """
     path, last = lane.path, lane.path.points.shape[0] - 1
-    wanted_rows = index + jnp.arange(count)
-    rows, speed = jnp.clip(wanted_rows, 0, last), lane.speed
+    numbers = index + jnp.arange(count)
+    rows = jnp.clip(numbers, 0, last)
+    ended = numbers >= last
     if isinstance(path, Lap):
-        rows = wanted_rows % last
-        squares = speed[rows] ** 2
-    else:
-        squares = jnp.where(wanted_rows >= last, 0.0, speed[rows] ** 2)
+        rows, ended = numbers % last, False
+    squares = jnp.where(ended, 0.0, lane.speed[rows] ** 2)
     # From behind: at each sample what can still slow down to all that follow.
-    gained, lost = (
-        2.0 * most * path.spacing * jnp.arange(count) for most in accelerations
-    )
+    ahead = 2.0 * path.spacing * jnp.arange(count)
+    gained, lost = (most * ahead for most in accelerations)
     wanted = jax.lax.cummin(squares + lost, reverse=True) - lost
     wanted = jax.lax.cummin(wanted - gained) + gained
     x, y, yaw, curvature = path.points[rows].T
@@ -169,7 +155,6 @@ def curve(road: RoadAhead, plan: Committed) -> Curve:
         direction=jnp.stack([forward * cos - aside * sin, forward * sin + aside * cos]),
         curvature=turn / stretch,
         stretch=stretch,
-        scale=scale,
         lengths=lengths,
         times=jnp.concatenate([jnp.zeros(1), jnp.cumsum(gaps)]),
         reached=jnp.concatenate([jnp.asarray([True]), jnp.cumsum(stood) == 0]),
@@ -183,15 +168,7 @@ def speed_profile(
     acceleration: Scalar | float,
     deceleration: Scalar | float,
 ) -> Float[Array, " sample"]:
-    """Return v² from a speed on, as near to what is wanted as accelerations allow.
-
-    Args:
-        most: v² that is wanted [m²/s²].
-        start: v² at the car, sample `BEHIND` [m²/s²].
-        spacing: of the samples [m].
-        acceleration: largest [m/s²].
-        deceleration: largest [m/s²].
-    """
+    """Return v² [m²/s²] from that at the car on, as near to `most` as it comes."""
     ahead = spacing * (jnp.arange(most.shape[0]) - BEHIND)
     fastest = start + 2.0 * acceleration * jnp.maximum(ahead, 0.0)
     slowest = start - 2.0 * deceleration * jnp.maximum(ahead, 0.0)
@@ -205,14 +182,9 @@ def window(
     place: Scalar,
     times: Float[Array, " horizon"],
 ) -> Reference:
-    """Return points of the reference, x, y, yaw, speed, (horizon, 4).
+    """Return where a reference is at times from now on: x, y, yaw, speed.
 
-    Args:
-        path: that the reference is beside.
-        committed: the reference.
-        along: the same in the world.
-        place: of the car, in samples from the first one.
-        times: of the points, from now on [s].
+    `along` is the same reference in the world, `place` that of the car, in samples.
     """
     squares, spacing = committed.square, path.spacing
     speed = jnp.sqrt(squares)
