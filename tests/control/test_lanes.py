@@ -328,17 +328,17 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
 def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
     policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{name}")
     driver, size = policy.in_lane(), len(policy.vehicle.state_names)
-    key, scene = jax.random.key(0), (road, circles(beside(road, POSTS), 0.8))
-    # Only traced: what is missing or of another shape fails here.
-    _, _, info = jax.eval_shape(
-        lambda key: driver.act(
-            policy.params, driver.init(key), jnp.zeros(size), jnp.zeros(2), scene
-        ),
-        key,
-    )
+    posts, at = circles(beside(road, POSTS), 0.8), jnp.zeros(size)
+
+    def told(lane):
+        """Only traced: what is missing or of another shape fails here."""
+        start, scene = driver.init(jax.random.key(0)), (lane, posts)
+        return driver.act(policy.params, start, at, jnp.zeros(2), scene)[2]
+
+    info = jax.eval_shape(told, road)
     assert info["reference"].shape == (policy.interface["horizon"], 4)
     assert {"clearance", "corridor", "admissible", "stopping"} <= set(info)
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
-        driver.act(None, None, None, None, (road._replace(left=jnp.ones(3)), scene[1]))
+        jax.eval_shape(told, road._replace(left=jnp.ones(3)))
     with pytest.raises(ValueError, match="no certified corridor"):
         sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/dynamic").in_lane()
