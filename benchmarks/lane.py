@@ -2,11 +2,10 @@
 
     python -m benchmarks.lane [--cars dynamic --systems lane --rows random --runs 200]
 
-Systems on the same roads, true cars, S3's schedule and sensor noise: the policy in its
-lane; MPPI whose plans must keep clear of what is in view, with the car itself as its
-model (oracle) or the model of the shipped policy of that car (learned); the same in the
-guard along the road. Writes benchmarks/lane.json, one line a row; what is there is not
-measured again.
+Systems on the same roads, true cars, S3's schedule and sensor noise: the wide policy in
+its lane, and the narrow one; MPPI that knows the car (oracle), whose plans must keep
+clear of what is in view; the same in the guard along the road. Writes
+benchmarks/lane.json, one line a row; what is there is not measured again.
 """
 
 import argparse
@@ -21,26 +20,25 @@ import numpy as np
 
 import sfkd_jax
 from benchmarks.recovery import CARS, HORIZON, NOISE, PERIOD, SHIPPED, shown
-from sfkd_jax import control, evaluation, models, policy, scenarios
-from sfkd_jax.lanes import Obstacles, clearance
+from sfkd_jax import control, evaluation, models, scenarios
+from sfkd_jax.lanes import circles, clearance
 from sfkd_jax.types import Controller
 
-SPEED, STEPS, IN_VIEW = 10.0, 600, 4
-"""Wanted [m/s]; of a run; obstacles that are shown at once."""
+STEPS, IN_VIEW = 600, 4
+"""Of a run; obstacles that are shown at once."""
 MARGIN, EDGE = 0.3, 5.25
 """That MPPI keeps from obstacles; from the middle of the road to its edges [m]."""
 APPEAR, SUDDEN = 40.0, 15.0
 """Distance at which an enemy's obstacle is seen at the latest, and a pedestrian [m]."""
-TOLD = ("corridor", "clearance", "gap")
 GUARDED = " in the guard"
-SYSTEMS = ("lane", "oracle", "learned", "oracle" + GUARDED, "learned" + GUARDED)
+SYSTEMS = ("lane", "narrow lane", "oracle", "oracle" + GUARDED)
 
 
 class Car:
     """A shipped policy, its true car, and the systems that drive it."""
 
-    def __init__(self, name, samples):
-        directory, self.name = SHIPPED / f"{name}_path", name
+    def __init__(self, name, samples, system):
+        directory = SHIPPED / f"{name}_{'lane' if system == 'lane' else 'path'}"
         planner = sfkd_jax.load(directory).settings["controller"]
         mppi = planner["mppi"] | {"num_samples": samples}
         self.policy = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
@@ -48,15 +46,11 @@ class Car:
 
     def system(self, name):
         """A controller of scenes, whose params are those of the policy."""
-        if name == "lane":
+        if name.endswith("lane"):
             length, width = (2.0 * half for half in scenarios.CAR)
             return self.policy.in_lane(car=(length, width))
-        model, params = models.physics(self.plant.step), {}
-        if not name.startswith("oracle"):
-            known = policy.restore(SHIPPED / self.name)
-            model, params = known.model, known.params
         task = control.path_tracking(
-            model,
+            models.physics(self.plant.step),
             control.tracking_cost(dt=PERIOD),
             control.path_feedback(wheelbase=self.plant.wheelbase),
             dt=PERIOD,
@@ -66,15 +60,12 @@ class Car:
         nothing = jnp.zeros((IN_VIEW, 2)), jnp.zeros(IN_VIEW), jnp.zeros(IN_VIEW)
         clear = control.constrained(task, too_near, nothing)
         planner = control.mppi(clear, num_samples=self.samples, horizon=HORIZON)
-        free = Controller(planner.init, lambda _, *rest: planner.act(params, *rest))
+        free = Controller(planner.init, lambda _, *rest: planner.act({}, *rest))
         return on_road(self.policy.guard(free) if name.endswith(GUARDED) else free)
 
     def program(self, name):
         """(scenarios) -> what is recorded of their episodes, (run, time)."""
-        system = self.system(name)
-        record = {
-            one: lambda info, one=one: 1.0 * info.get(one, jnp.nan) for one in TOLD
-        }
+        system, claims = self.system(name), name != "oracle"
 
         def run(scenario, key):
             made = evaluation.simulate(
@@ -86,26 +77,26 @@ class Car:
                 dt=PERIOD,
                 horizon=HORIZON,
                 observation_noise=NOISE,
-                record=record,
+                record={"corridor": lambda info: info["corridor"]} if claims else {},
             )
             # From the middle of the road, also where another reference is followed.
             foot = jax.vmap(scenarios.point_at, (None, 0))(scenario.path, made.progress)
             away, yaw = made.states[1:, :2] - foot[:, :2], foot[:, 2]
             middle = away[:, 1] * jnp.cos(yaw) - away[:, 0] * jnp.sin(yaw)
-            told = {one: made.signals[one] for one in TOLD}
-            told |= {"lateral": made.lateral, "along": made.progress}
-            return told | {"middle": middle, "speed": made.states[1:, 3]}
+            told = {"along": made.progress, "speed": made.states[1:, 3]}
+            told |= {"corridor": jnp.full(STEPS, jnp.nan)} | made.signals
+            return told | {"lateral": made.lateral, "middle": middle}
 
         def drive(roads):
             # The same noise for every system.
             keys = jax.random.split(jax.random.key(36), len(roads.speed))
             if jax.default_backend() != "cpu":
                 return jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(roads, keys))
-            every = [
-                alone(*jax.tree.map(lambda leaf, i=i: leaf[i], (roads, keys)))
+            rows = (
+                jax.tree.map(lambda x, i=i: x[i], (roads, keys))
                 for i in range(len(keys))
-            ]
-            return jax.tree.map(lambda *leaves: np.stack(leaves), *every)
+            )
+            return jax.tree.map(lambda *x: np.stack(x), *(alone(*one) for one in rows))
 
         alone = jax.jit(run)
         return drive
@@ -114,8 +105,7 @@ class Car:
 def too_near(data, state, action, target, at):
     """How much nearer than `MARGIN` a planned state is to the circles in view [m]."""
     position, radius, present = data
-    still, point = jnp.zeros(IN_VIEW), jnp.zeros((IN_VIEW, 2))
-    seen = Obstacles(position[:, None], still, point, radius, present > 0.5)
+    seen = circles(position, radius)._replace(present=present > 0.5)
     direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
     apart = clearance(seen, state[:2], direction=direction, half=scenarios.CAR)
     return jnp.maximum(MARGIN - apart, -1e3)
@@ -126,7 +116,7 @@ def on_road(controller):
 
     def act(params, memory, seen, env, scene):
         (lane, shown), (along, inner) = scene, memory
-        along, _ = scenarios.project(lane.path, seen[:2], along + SPEED * PERIOD)
+        along, _ = scenarios.project(lane.path, seen[:2], along + 1.0)
         ahead = scenarios.reference_window(
             lane.path, along, lane.speed[0], dt=PERIOD, horizon=HORIZON
         )
@@ -145,7 +135,6 @@ def courses(car, count, seed):
         duration=STEPS * PERIOD,
         state_size=len(car.plant.state_names),
         dt=PERIOD,
-        speed=SPEED,
         peak_curvature=0.004,
         wavelengths=(100.0, 300.0),
     )
@@ -189,12 +178,12 @@ def counted(car, made):
     }
 
 
-def random_rows(car, system, drive, given):
+def random_rows(car, drive, given):
     """Courses of the scenario."""
     yield "random courses", counted(car, drive(courses(car, given.runs, 35)))
 
 
-def pedestrian_rows(car, system, drive, given):
+def pedestrian_rows(car, drive, given):
     """Somebody steps out onto the road and stands there, once in a run."""
     draw, roads = np.random.default_rng(37), courses(car, given.runs, 37)
     half, shape = given.runs // 2, roads.course.along.shape
@@ -209,7 +198,7 @@ def pedestrian_rows(car, system, drive, given):
         yield f"pedestrian, friction {friction}", counted(car, part)
 
 
-def enemy_rows(car, system, drive, given):
+def enemy_rows(car, drive, given):
     """Places, and when they are seen first, by a cross-entropy search."""
     draw, base = np.random.default_rng(39), courses(car, given.runs, 39)
     mean, spread, found, hits = np.zeros(3 * base.course.along.shape[1]), 1.0, [], []
@@ -243,27 +232,7 @@ def enemy_rows(car, system, drive, given):
     )
 
 
-def cost_rows(car, system, drive, given):
-    """Control steps one after the other, on this machine."""
-    controller, road = car.system(system), courses(car, 1, 41)
-    road = jax.tree.map(lambda leaf: leaf[0], road)
-    scene = road.course.lane, scenarios.in_view(road.course, jnp.asarray(30.0))
-    act, memory, times = jax.jit(controller.act), controller.init(jax.random.key(1)), []
-    seen = car.policy.params, road.initial_state, road.envs[0], scene
-    for _ in range(110):
-        began = time.perf_counter()
-        _, memory, _ = jax.block_until_ready(act(seen[0], memory, *seen[1:]))
-        times.append(1e3 * (time.perf_counter() - began))
-    median, slow = np.median(times[10:]), np.quantile(times[10:], 0.99)
-    yield "a call", {"median_ms": shown(median, 2), "p99_ms": shown(slow, 2)}
-
-
-ROWS = {
-    "random": random_rows,
-    "pedestrian": pedestrian_rows,
-    "enemy": enemy_rows,
-    "cost": cost_rows,
-}
+ROWS = {"random": random_rows, "pedestrian": pedestrian_rows, "enemy": enemy_rows}
 
 
 def main():
@@ -286,10 +255,10 @@ def main():
         missing = [one for one in given.rows if (name, system, one) not in done]
         if not missing:
             continue
-        car = Car(name, given.samples)
+        car = Car(name, given.samples, system)
         drive = car.program(system)
         for group in missing:
-            for label, found in ROWS[group](car, system, drive, given):
+            for label, found in ROWS[group](car, drive, given):
                 named = {"car": name, "system": system, "group": group, "row": label}
                 rows.append(named | found | about)
                 print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)

@@ -246,6 +246,24 @@ def peers():
     )
 
 
+def lane():
+    """Obstacles that are seen late: what each system hits, and how fast it is."""
+    rows = [row for row in read("benchmarks/lane.json") if "collisions" in row]
+    found = {(row["car"], row["system"], row["row"]): row for row in rows}
+    columns = list(dict.fromkeys((row["car"], row["system"]) for row in rows))
+
+    def cell(car, system, label):
+        row = found.get((car, system, label))
+        return row and f"{row['collisions']}/{row['runs']}, {row['mean_speed']:.1f}"
+
+    head = ["runs with a collision, mean speed [m/s]", *map(": ".join, columns)]
+    labels = dict.fromkeys(label for _, _, label in found)
+    lines = [
+        [one, *(cell(*column, one) or "–" for column in columns)] for one in labels
+    ]
+    return table(head, lines)
+
+
 BLOCKS = {
     "README.md": {"corridor": corridor},
     "docs/corridor.md": {
@@ -253,6 +271,7 @@ BLOCKS = {
         "shield": shield,
         "recovery": recovery,
     },
+    "docs/lane.md": {"lane": lane},
     "docs/planner.md": {"timing": timing},
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/results.md": results.TABLES | {"peers": peers},
