@@ -221,11 +221,20 @@ class InLane:
         # Its observation is a situation; it needs neither e nor a reference.
         act: Any = self.planner.act
         row, after, info = act(None, planner, situation, None, None)
-        found = task.reference(situation, row)
-        better = info["mean_cost"] < (1.0 - self.better) * kept.cost
-        better |= kept.violation > 0.0
+        usable = info["healthy"] & info["constraints_kept"]
         # A plan that continues an old one is not the one that was evaluated.
-        taken = better & info["healthy"] & info["constraints_kept"]
+        cost = jnp.where(usable, info["mean_cost"], jnp.inf)
+        rows = jnp.concatenate([row[None], task.ways_round(situation)])
+        ways = jax.vmap(
+            partial(task.step, planner.tuning.cost, situation, jnp.zeros(()))
+        )(rows[1:])
+        costs = jnp.append(cost, jnp.where(ways.state <= 0.0, ways.cost, jnp.inf))
+        chosen = jnp.argmin(costs)
+        found = task.reference(situation, rows[chosen])
+        # The next search begins there.
+        after = after._replace(plan=rows[chosen][None])
+        better = costs[chosen] < (1.0 - self.better) * kept.cost
+        taken = (better | (kept.violation > 0.0)) & jnp.isfinite(costs[chosen])
         stop = task.stop(situation, kept)
         otherwise = jax.tree.map(partial(jnp.where, free), before, stop)
         return after, jax.tree.map(partial(jnp.where, taken), found, otherwise)

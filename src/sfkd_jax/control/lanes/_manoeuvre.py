@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -47,7 +48,8 @@ class Class:
         half: half of the length and width of the car [m].
         corridor: bound of |e_y| [m].
         heading: bound of |e_ψ| [rad].
-        acceleration: largest [m/s²].
+        change: largest |dv/dt| [m/s²]; with the lateral acceleration in an ellipse.
+        acceleration: largest that is planned [m/s²].
         deceleration: largest in a planned change of speed [m/s²].
         braking: largest of a stop that cannot be gentler [m/s²].
         share: of the grip that is planned with.
@@ -61,6 +63,7 @@ class Class:
     half: tuple[Positive, Positive]
     corridor: NonNegative
     heading: NonNegative
+    change: Positive = math.inf
     acceleration: Positive = 1.0
     deceleration: Positive = 1.0
     braking: Positive = 6.0
@@ -197,6 +200,49 @@ class Manoeuvres:
         square = jnp.concatenate([before.square[:BEHIND], square[BEHIND:]])
         return Committed(before.index, move, square)
 
+    def ways_round(self, situation: Situation) -> Float[Array, "way 5"]:
+        """Return rows that pass what is ahead on either side, at several speeds.
+
+        Of the next two obstacles both, or the second alone. Few samples fall into the
+        gap between two of them, and none from one side of it to the other.
+        """
+        road, kind, obstacles = situation.road, self.kind, situation.obstacles
+        spacing, count = road.spacing, road.curvature.shape[0]
+        longest, splice = 0.5 * spacing * (count - 1 - SPLICE), spacing * SPLICE
+        centres = obstacles.position[:, 0].T
+        away = jnp.linalg.norm(centres[..., None] - road.position[:, None], axis=0)
+        nearest = jnp.argmin(away, axis=1)
+        (x, y), (cos, sin) = (
+            centres - road.position[:, nearest],
+            road.direction[:, nearest],
+        )
+        size = obstacles.radius + jnp.linalg.norm(obstacles.half, axis=1)
+        # From where on the car is beside it, and how far aside its middle has to be.
+        begin = spacing * nearest - size - kind.half[0]
+        room = size + kind.half[1] + kind.margin + self.comfort
+        ahead = obstacles.present & (begin > spacing * situation.place)
+        # Instead of one that is not there: the middle of the road at the horizon.
+        none = jnp.asarray([spacing * count, 0.0, 0.0])[:, None]
+        known = jnp.stack([begin, cos * y - sin * x, room])
+        known = jnp.append(jnp.where(ahead, known, none), jnp.tile(none, 2), axis=1)
+        (first, second), aside, room = known[:, jnp.argsort(known[0])[:2]]
+        middle = 0.5 * (SHORTEST + longest)
+        to_both = first - splice - middle, second - first - middle
+        to_second = second - splice - middle, longest - middle
+
+        def row(one: float, two: float, slower: Scalar, both: bool) -> Control:
+            left = aside + jnp.asarray([one, two]) * room
+            over = to_both if both else to_second
+            start = left[0] if both else left[1]
+            return jnp.stack([start, over[0], left[1], over[1], slower])
+
+        sides, speeds = (1.0, -1.0), jnp.asarray([0.0, -2.0, -4.0])
+        ways = [
+            (*pair, slower, True) for *pair, slower in product(sides, sides, speeds)
+        ]
+        ways += [(0.0, *pair, False) for pair in product(sides, speeds)]
+        return jnp.stack([row(*way) for way in ways])
+
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
         before, spacing = situation.committed, situation.road.spacing
@@ -223,12 +269,13 @@ class Manoeuvres:
         along = curve(road, plan)
         curvature = along.curvature
         turning = jnp.append(jnp.diff(curvature) / along.lengths, 0.0)
+        change = jnp.append(0.5 * jnp.diff(square) / along.lengths, 0.0)
         shares = jnp.stack(
             [
                 jnp.abs(curvature) / kind.curvature,
                 jnp.abs(turning) / kind.turning,
                 square**1.5 * jnp.abs(turning) / kind.jerk,
-                square * jnp.abs(curvature) / lateral,
+                jnp.hypot(square * curvature / lateral, change / kind.change),
                 square / kind.speed[1] ** 2,
             ]
         )
