@@ -68,21 +68,6 @@ def test_no_key_is_used_twice(name):
         jax.jit(make(name))(jax.random.key(0))
 
 
-def test_a_lane_change_ends_in_the_other_lane_and_comes_back():
-    family = scenarios.scenario(
-        name="double_lane_change", duration=30.0, state_size=4, dt=DT
-    )
-    points = np.asarray(jit(jax.vmap(family))(KEYS[:8]).path.points)
-    offset, heading = points[..., 1], points[..., 2]
-    for lateral, yaw in zip(offset, heading, strict=True):
-        assert np.max(np.abs(lateral)) == pytest.approx(3.5, rel=0.02)
-        assert np.abs(lateral[:40]).max() == 0.0  # the run-up of at least 20 m
-        apart = np.abs(lateral) > 3.4
-        assert np.abs(yaw[apart]).max() < 0.08
-        assert np.mean(np.abs(lateral) < 0.05) > 0.4
-    assert {np.sign(one[np.abs(one).argmax()]) for one in offset} == {-1.0, 1.0}
-
-
 def test_obstacles_stand_as_far_apart_as_asked_and_are_seen_when_the_car_is_near():
     family = scenarios.scenario(name="obstacles", duration=60.0, state_size=4, dt=DT)
     made = jit(family)(KEYS[0])

@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sfkd_jax.certification._alarms import (
     Loop,
@@ -76,6 +76,32 @@ ELITE = 0.1
 """Part of a generation that the next one is drawn around."""
 
 
+def _driver(
+    loop: Loop,
+    limits: DriveClass,
+    excited: Mapping[str, Any],
+    groups: Int[Array, " run"],
+    conditions: Callable[[Key], Array],
+) -> Callable[[Key], Trajectory]:
+    """Return key -> runs of the groups, each under its own conditions; compiled."""
+    drive = partial(
+        drive_along_path,
+        loop.plant,
+        limits=limits,
+        sensors=partial(sensor_effect, loop),
+        offset=(0.0, 0.0, 0.0),
+        burn_in=0,
+        **excited,
+    )
+
+    def driven(key: Key) -> Trajectory:
+        env_key, run_key = jax.random.split(key)
+        envs = jax.vmap(conditions)(jax.random.split(env_key, len(groups)))
+        return drive(envs, run_key, groups=groups)
+
+    return jax.jit(driven)
+
+
 def certify_corridor(
     loop: Loop,
     outputs: Mapping[str, Any],
@@ -119,29 +145,15 @@ def certify_corridor(
     # Streams of their own: the data set's runs must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    drive = partial(
-        drive_along_path,
-        loop.plant,
-        limits=limits,
-        sensors=partial(sensor_effect, loop),
-        offset=(0.0, 0.0, 0.0),
-        burn_in=0,
-        **excited,
-    )
     steps, dt = round(duration / loop.plant.dt), loop.plant.dt
     switching = partial(
         random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
     )
-
-    def driven(conditions: Callable[[Key], Array], key: Key) -> Trajectory:
-        env_key, run_key = jax.random.split(key)
-        groups = jnp.repeat(jnp.arange(len(names)), runs)
-        envs = jax.vmap(conditions)(jax.random.split(env_key, len(groups)))
-        return drive(envs, run_key, groups=groups)
-
     # Jitted once each: the three parts under the conditions share one program.
-    switching = jax.jit(partial(driven, switching))
-    kinds = [switching] * 3 + [jax.jit(partial(driven, from_s3(steps, dt)))]
+    runs_of = partial(
+        _driver, loop, limits, excited, jnp.repeat(jnp.arange(len(names)), runs)
+    )
+    kinds = [runs_of(switching)] * 3 + [runs_of(from_s3(steps, dt))]
     simulate = jax.jit(partial(_simulate_nominal, loop))
     keys = zip(kinds, run_keys, jax.random.split(sensor_key, 4), strict=True)
     measured = [
@@ -206,15 +218,13 @@ def _worst_group(
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """The bounds of the worst group and their coverage; runs are group after group."""
     own, shares = {}, {}
-    units, calibration, test = (
-        np.split(part, len(names)) for part in (units, calibration, test)
-    )
-    for name, *parts in zip(names, units, calibration, strict=True):
-        own[name] = calibrate_corridor(*parts, level=level)
+    parts = [np.split(part, len(names)) for part in (units, calibration, test)]
+    for name, unit, calibrated, _ in zip(names, *parts, strict=True):
+        own[name] = calibrate_corridor(unit, calibrated, level=level)
     bounds = {
         kind: max(each[kind] for each in own.values()) for kind in (*JOINT, *ALONE)
     }
-    for name, part in zip(names, test, strict=True):
+    for name, part in zip(names, parts[2], strict=True):
         shares[name] = corridor_coverage(bounds, part)
     least = min(shares.values(), key=lambda share: share["coverage"])
     if len(names) == 1:

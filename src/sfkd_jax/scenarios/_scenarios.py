@@ -18,7 +18,7 @@ from sfkd_jax.scenarios._conditions import (
     wet_road,
 )
 from sfkd_jax.scenarios._obstacles import Course, random_course
-from sfkd_jax.scenarios._paths import double_lane_change, smooth_path
+from sfkd_jax.scenarios._paths import smooth_path
 from sfkd_jax.types import Key, Scalar, State
 
 
@@ -65,13 +65,6 @@ ROADS: dict[str, Road] = {
     "s1": Road(lambda key, steps, dt: uniform_road(key, steps=steps)),
     "s2": Road(lambda key, steps, dt: wet_road(key, steps=steps, dt=dt)),
     "s3": Road(lambda key, steps, dt: switching_road(key, steps=steps, dt=dt)),
-    "double_lane_change": Road(
-        # The first of three keys, by which its published episodes were drawn.
-        lambda key, steps, dt: uniform_road(
-            jax.random.split(key, 3)[0], steps=steps, friction=(0.6, 0.9)
-        ),
-        double_lane_change,
-    ),
     "obstacles": Road(
         lambda key, steps, dt: switching_road(key, steps=steps, dt=dt),
         course=random_course,
@@ -80,7 +73,6 @@ ROADS: dict[str, Road] = {
 """Scenarios by name; an entry is all that a new one needs.
 
 "s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road.
-"double_lane_change" has a path of its own, friction from wet to dry and no wind.
 "obstacles" is S3 with a `random_course`.
 """
 

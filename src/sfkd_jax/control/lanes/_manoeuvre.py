@@ -237,11 +237,9 @@ class Manoeuvres:
             return jnp.stack([start, over[0], left[1], over[1], slower])
 
         sides, speeds = (1.0, -1.0), jnp.asarray([0.0, -2.0, -4.0])
-        ways = [
-            (*pair, slower, True) for *pair, slower in product(sides, sides, speeds)
-        ]
-        ways += [(0.0, *pair, False) for pair in product(sides, speeds)]
-        return jnp.stack([row(*way) for way in ways])
+        ways = [row(one, two, v, True) for one, two, v in product(sides, sides, speeds)]
+        ways += [row(0.0, two, v, False) for two, v in product(sides, speeds)]
+        return jnp.stack(ways)
 
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
