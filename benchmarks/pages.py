@@ -246,6 +246,26 @@ def peers():
     )
 
 
+def wide():
+    """What the certificates of the policies for lanes say."""
+    about = [
+        read(PRETRAINED / f"{car}_lane/certificate.json")["corridor"] for car in CARS
+    ]
+    groups = list(about[0]["by_group"])
+    lines = [
+        ["corridor [m]", *(f"{one['corridor_m']:.3f}" for one in about)],
+        *(
+            [
+                f"fresh runs inside: {group.replace('_', ' ')}",
+                *(f"{one['by_group'][group]['coverage']:.3f}" for one in about),
+            ]
+            for group in groups
+        ),
+        ["S3", *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about)],
+    ]
+    return table(["", *CARS], lines)
+
+
 def lane():
     """Obstacles that are seen late: what each system hits, and how fast it is."""
     rows = [row for row in read("benchmarks/lane.json") if "collisions" in row]
@@ -271,7 +291,7 @@ BLOCKS = {
         "shield": shield,
         "recovery": recovery,
     },
-    "docs/lane.md": {"lane": lane},
+    "docs/lane.md": {"wide": wide, "lane": lane},
     "docs/planner.md": {"timing": timing},
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/results.md": results.TABLES | {"peers": peers},

@@ -11,6 +11,7 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import control
+from sfkd_jax.control.lanes._manoeuvre import Situation
 from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
 from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic
@@ -256,6 +257,24 @@ def test_somebody_who_crosses_is_passed_where_he_is_then(lane, road):
     assert cars[-1, 0] > 75.0
 
 
+def test_ways_round_lead_from_one_side_of_an_obstacle_to_the_other_of_the_next():
+    lane = lane_along(path_from_curvature(jnp.zeros(400), spacing=0.5), width=8.0)
+    ahead, count = road_ahead(lane, jnp.asarray(0), 200, (1.0, 1.0)), 200
+    straight = Committed(jnp.asarray(0), jnp.zeros((3, count)), jnp.full(count, 100.0))
+    task = control.Manoeuvres(kind=KIND, dt=DT)
+    posts = circles(jnp.asarray([[40.0, 1.2], [85.0, -1.2], [-20.0, 0.0]]), 0.8)
+    place, grip = jnp.asarray(2.0), jnp.asarray(0.9 * 9.81)
+    scene = Situation(ahead, straight, posts, place, grip, jnp.asarray(True))
+    rows = jit(task.ways_round)(scene)
+    step = partial(task.step, jnp.asarray(task.weights), scene, jnp.zeros(()))
+    judged = jit(jax.vmap(step))(rows)
+    assert judged.state.shape == (18,)
+    best = task.reference(scene, rows[jnp.argmin(judged.state)])
+    assert jnp.min(judged.state) == 0.0
+    assert best.move[0, 80] < -0.5
+    assert best.move[0, 170] > 0.5
+
+
 @pytest.mark.parametrize("attack", ["jumps", "inside", "nan", "edge"])
 def test_what_is_attacked_is_not_admitted(lane, road, attack):
     none = circles(beside(road, POSTS[:1]), 0.8)
@@ -324,7 +343,7 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
         )
 
 
-@pytest.mark.parametrize("name", ["dynamic_path", "kinematic_path"])
+@pytest.mark.parametrize("name", ["dynamic_lane", "kinematic_path"])
 def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
     policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{name}")
     driver, size = policy.in_lane(), len(policy.vehicle.state_names)
@@ -337,7 +356,7 @@ def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
 
     info = jax.eval_shape(told, road)
     assert info["reference"].shape == (policy.interface["horizon"], 4)
-    assert {"clearance", "corridor", "admissible", "stopping"} <= set(info)
+    assert {"clearance", "offset", "admissible", "stopping", "corridor"} <= set(info)
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
         jax.eval_shape(told, road._replace(left=jnp.ones(3)))
     with pytest.raises(ValueError, match="no certified corridor"):

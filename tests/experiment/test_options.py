@@ -114,4 +114,4 @@ def test_only_a_system_with_a_corridor_drives_round_obstacles():
     chosen = settings("+experiment=s3_body", "scenario=obstacles")
     system = build.reference_systems(build.build_vehicle(chosen.vehicle))["oracle"]
     with pytest.raises(ValueError, match=r"certified corridor, and oracle has none"):
-        evaluating.SystemEvaluation(chosen, "oracle", system, None)
+        evaluating.SystemEvaluation(chosen, "oracle", system)

@@ -55,7 +55,6 @@ def test_a_batch_of_episodes_is_finite_starts_on_its_paths_and_stays_in_the_box(
 def test_an_episode_follows_from_its_key_alone_and_another_key_makes_another(name):
     again = sampled(name)(KEYS[::-1])
     assert same(at(again, slice(None, None, -1)), batch(name), rtol=0, atol=0)
-    assert sampled(name)._cache_size() == 1  # other keys, no other trace
     curvatures, envs = np.asarray(again.path.points)[..., 3], np.asarray(again.envs)
     assert len(np.unique(curvatures.round(5), axis=0)) == len(KEYS)
     if name != "s1":  # whose friction is constant and whose air is calm

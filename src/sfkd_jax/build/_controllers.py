@@ -405,7 +405,10 @@ def build_in_lane(
     # with lane changes states it.
     sharpest = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
     turning, fastest = under.get("curvature_slope", sharpest), road[1][REFERENCE_SPEED]
-    change = under.get("acceleration", math.inf)
+    # A class of constant speeds was not asked about changes: they are gentle.
+    changes: Any = {}
+    if most := under.get("acceleration"):
+        changes = {"change": most, "deceleration": 0.75 * most}
     kind = control.Class(
         curvature=min(under["peak_curvature"], road[1][CURVATURE]),
         turning=turning,
@@ -415,9 +418,7 @@ def build_in_lane(
         half=(0.5 * car[0], 0.5 * car[1]),
         corridor=corridor["corridor_m"],
         heading=0.0 if state is None else max(abs(end[HEADING]) for end in state),
-        change=change,
-        # A class without changes of speed was not asked about them.
-        deceleration=min(0.75 * change, 1.0 if math.isinf(change) else 1.5),
+        **changes,
         braking=6.0 if plant.speed_loop else -plant.control_low[1],
     )
     follows = float(np.mean(law.gain[..., 1, PATH_SPEED]))

@@ -48,7 +48,7 @@ class Class:
         half: half of the length and width of the car [m].
         corridor: bound of |e_y| [m].
         heading: bound of |e_ψ| [rad].
-        change: largest |dv/dt| [m/s²]; with the lateral acceleration in an ellipse.
+        change: largest |dv/dt| [m/s²], in an ellipse with the lateral acceleration.
         acceleration: largest that is planned [m/s²].
         deceleration: largest in a planned change of speed [m/s²].
         braking: largest of a stop that cannot be gentler [m/s²].
@@ -63,7 +63,7 @@ class Class:
     half: tuple[Positive, Positive]
     corridor: NonNegative
     heading: NonNegative
-    change: Positive = math.inf
+    change: Positive = 1e6
     acceleration: Positive = 1.0
     deceleration: Positive = 1.0
     braking: Positive = 6.0
