@@ -2,10 +2,10 @@
 
     python -m benchmarks.lane [--cars dynamic --systems lane --rows random --runs 200]
 
-Systems on the same roads, true cars, S3's schedule and sensor noise: the wide policy in
-its lane, and the narrow one; MPPI that knows the car (oracle), whose plans must keep
-clear of what is in view; the same in the guard along the road. Writes
-benchmarks/lane.json, one line a row; what is there is not measured again.
+Systems on the same roads, true cars, S3's schedule and sensor noise: the policy in its
+lane; MPPI that knows the car (oracle), whose plans must keep clear of what is in view;
+the same in the guard along the road. Writes benchmarks/lane.json, one line a row; what
+is there is not measured again.
 """
 
 import argparse
@@ -31,7 +31,7 @@ MARGIN, EDGE = 0.3, 5.25
 APPEAR, SUDDEN = 40.0, 15.0
 """Distance at which an enemy's obstacle is seen at the latest, and a pedestrian [m]."""
 GUARDED = " in the guard"
-SYSTEMS = ("lane", "narrow lane", "oracle", "oracle" + GUARDED)
+SYSTEMS = ("lane", "oracle", "oracle" + GUARDED)
 
 
 class Car:
@@ -46,7 +46,7 @@ class Car:
 
     def system(self, name):
         """A controller of scenes, whose params are those of the policy."""
-        if name.endswith("lane"):
+        if name == "lane":
             length, width = (2.0 * half for half in scenarios.CAR)
             return self.policy.in_lane(car=(length, width))
         task = control.path_tracking(
