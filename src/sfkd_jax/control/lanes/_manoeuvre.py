@@ -181,8 +181,7 @@ class Manoeuvres:
         """Return the reference of a row of parameters."""
         road, before = situation.road, situation.committed
         spacing, count = road.spacing, before.square.shape[0]
-        longest = 0.5 * spacing * (count - 1 - SPLICE)
-        middle = 0.5 * (SHORTEST + longest)
+        longest, middle = _lengths(road)
         first, second = jnp.clip(row[1:4:2] + middle, SHORTEST, longest)
         ahead = spacing * jnp.arange(count - SPLICE)
         away = quintic(before.move[:, SPLICE], row[0], first, ahead)[:3]
@@ -208,14 +207,12 @@ class Manoeuvres:
         """
         road, kind, obstacles = situation.road, self.kind, situation.obstacles
         spacing, count = road.spacing, road.curvature.shape[0]
-        longest, splice = 0.5 * spacing * (count - 1 - SPLICE), spacing * SPLICE
+        (longest, middle), splice = _lengths(road), spacing * SPLICE
         centres = obstacles.position[:, 0].T
         away = jnp.linalg.norm(centres[..., None] - road.position[:, None], axis=0)
         nearest = jnp.argmin(away, axis=1)
-        (x, y), (cos, sin) = (
-            centres - road.position[:, nearest],
-            road.direction[:, nearest],
-        )
+        x, y = centres - road.position[:, nearest]
+        cos, sin = road.direction[:, nearest]
         size = obstacles.radius + jnp.linalg.norm(obstacles.half, axis=1)
         # From where on the car is beside it, and how far aside its middle has to be.
         begin = spacing * nearest - size - kind.half[0]
@@ -226,14 +223,12 @@ class Manoeuvres:
         known = jnp.stack([begin, cos * y - sin * x, room])
         known = jnp.append(jnp.where(ahead, known, none), jnp.tile(none, 2), axis=1)
         (first, second), aside, room = known[:, jnp.argsort(known[0])[:2]]
-        middle = 0.5 * (SHORTEST + longest)
         to_both = first - splice - middle, second - first - middle
         to_second = second - splice - middle, longest - middle
 
         def row(one: float, two: float, slower: Scalar, both: bool) -> Control:
             left = aside + jnp.asarray([one, two]) * room
-            over = to_both if both else to_second
-            start = left[0] if both else left[1]
+            start, over = (left[0], to_both) if both else (left[1], to_second)
             return jnp.stack([start, over[0], left[1], over[1], slower])
 
         sides, speeds = (1.0, -1.0), jnp.asarray([0.0, -2.0, -4.0])
@@ -315,3 +310,9 @@ class Manoeuvres:
         gap, edge = gap - LATE - self.kind.margin, edge - self.kind.margin
         gap = jnp.where(situation.clean, jnp.where(counts, gap, jnp.inf), -jnp.inf)
         return gap, jnp.where(counts, edge, jnp.inf)
+
+
+def _lengths(road: RoadAhead) -> tuple[Scalar, Scalar]:
+    """The longest lateral move, of which two fit into the road, and the middle [m]."""
+    longest = 0.5 * road.spacing * (road.curvature.shape[0] - 1 - SPLICE)
+    return longest, 0.5 * (SHORTEST + longest)
