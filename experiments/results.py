@@ -44,7 +44,6 @@ LABELS = {
     "icode_mppi_extrinsic": "ICODE-MPPI, e extrinsic",
     "icode_mppi_reads_env": "ICODE-MPPI, reads e",
     "icode_mppi_one_step": "ICODE-MPPI, one step",
-    "r2dn": "R2DN",
     "law": "Law alone",
     "nominal": "Nominal bicycle",
     "oracle": "Oracle",

@@ -77,7 +77,6 @@ PATH_MODELS = {
     "sfkd": ("model=sfkd_path",),
     "free": ("model=sfkd_path", "model.residual=free", "model.learn_alpha=false"),
     "neural_ode": ("model=neural_ode", "model.frame=path", "training=state_model"),
-    "r2dn": ("model=r2dn", "model.frame=path"),
 }
 
 

@@ -8,7 +8,6 @@ from sfkd_jax.models._icode import icode as icode
 from sfkd_jax.models._icode import icode_mppi as icode_mppi
 from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._own import own as own
-from sfkd_jax.models._r2dn import r2dn as r2dn
 from sfkd_jax.models.sfkd import sfkd as sfkd
 
 FACTORIES = {
@@ -17,7 +16,6 @@ FACTORIES = {
     "icode": icode,
     "icode_mppi": icode_mppi,
     "control_synth": control_synth,
-    "r2dn": r2dn,
     "koopman_mpc": koopman,
 }
 """Learned models: name -> factory(space, *, settings).

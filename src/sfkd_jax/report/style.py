@@ -54,7 +54,6 @@ SYSTEMS = {
     "icode_mppi_extrinsic": Look(
         "ICODE-MPPI, f(s, u) + G(s, u) e", "#a63603", (1, 1, 3, 1)
     ),
-    "r2dn": Look("R2DN", "#999933", _RIVAL),
     "nominal": Look("Nominal", SECOND, width=1.4),
     "oracle": Look("Oracle", "#3c3c3c", (3, 1.2), 1.4),
     "law": Look("Law alone", "#a0522d", (1.5, 1)),

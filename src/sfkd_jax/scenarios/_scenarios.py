@@ -46,18 +46,15 @@ Family: TypeAlias = Callable[[Key], Scenario]
 
 
 class Road(NamedTuple):
-    """What a scenario is by name: an environment, and a path of its own or none.
+    """What a scenario is by name: an environment, and obstacles or none.
 
     Attributes:
         conditions: (key, steps, sampling period [s]) -> e_0 … e_{T-1}.
-        path: (key, length [m]) -> path from the origin along x; None for `smooth_path`
-            with the curvature and the wavelengths of the settings.
         course: (key, path, speed=v [m/s]) -> obstacles on the path; None for a road
             that is free.
     """
 
     conditions: Callable[[Key, int, float], Schedule]
-    path: Callable[[Key, float], Path] | None = None
     course: Callable[..., Course] | None = None
 
 
@@ -107,8 +104,6 @@ def scenario(
     length = speed * duration * 1.1 + 50.0
 
     def path(key: Key) -> Path:
-        if road.path is not None:
-            return road.path(key, length)
         return smooth_path(
             key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
         )

@@ -110,8 +110,7 @@ def multi_step_loss(
     # The infinite-horizon radius divides by 1 − α, so α must be known in training.
     if tube and None in (known.rate, known.explicit):
         raise ValueError(
-            "training.loss.tube needs a model that contracts by construction: "
-            "model=sfkd… or model=r2dn"
+            "training.loss.tube needs model=sfkd…, which contracts by construction"
         )
     if len(tube) > space.body_mean.shape[0]:
         raise ValueError(

@@ -43,8 +43,8 @@ class PerEnvironment(NamedTuple):
     embedding: Float[Array, " embedding"]
 
 
-class Networks(nn.Module):
-    """What a latent model learns besides its encoder: `shared`, functions of e, `rate`.
+class Learned(nn.Module):
+    """Embedding ψ(e), operators, residual, decoder and transport; fields as of `sfkd`.
 
     Attributes:
         rank: r.
@@ -53,6 +53,9 @@ class Networks(nn.Module):
         embedding: size of ψ(e).
         pose: whether there is a decoder of the pose.
         transport: whether Q(e) is learned; otherwise it is the identity.
+        kind: of the residual, see `RESIDUALS`.
+        joint: whether operators and residual are bounded as one map by α = ρ + β;
+            otherwise A(e) is bounded by ρ and the residual by β.
     """
 
     rank: int
@@ -61,22 +64,6 @@ class Networks(nn.Module):
     embedding: int
     pose: bool
     transport: bool
-
-    @property
-    def bounded(self) -> bool:
-        """Whether a step contracts by construction."""
-        return True
-
-
-class Learned(Networks):
-    """Embedding ψ(e), operators, residual, decoder and transport; fields as of `sfkd`.
-
-    Attributes:
-        kind: of the residual, see `RESIDUALS`.
-        joint: whether operators and residual are bounded as one map by α = ρ + β;
-            otherwise A(e) is bounded by ρ and the residual by β.
-    """
-
     vertices: int
     residual_hidden: Sequence[int]
     decoder_hidden: Sequence[int]

@@ -14,7 +14,6 @@ from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
-    Networks,
     PerEnvironment,
     SharedWeights,
 )
@@ -82,13 +81,13 @@ class SfkdFiber(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LatentModel:
-    """The functions of `Model`: of SFKD, and of its special case R2DN.
+    """The functions of `Model`.
 
     `learned` is all that is learned but the encoder; the last two are of `hinge`.
     """
 
     space: Space
-    learned: Networks
+    learned: Learned
     encoder: Encoder
     environment: bool
     soft_penalty: float = 0.0
