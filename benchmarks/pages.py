@@ -92,7 +92,7 @@ def shield():
 
     def cells(car, kind):
         kept = rows[car, f"planner {kind}: guard"]
-        free = rows[car, f"planner {kind}: bare"]["left_the_lane"]
+        free = rows[car, f"planner {kind}: bare"]["left_the_path"]
         return [
             f"{free} of {kept['runs']} → {kept['left_the_lane']}",
             f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",

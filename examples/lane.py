@@ -12,7 +12,7 @@ from sfkd_jax import evaluation, scenarios
 
 asked = {"--runs": 1, "--seed": 0, "--vehicle": "dynamic"}
 asked |= dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
-policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{asked['--vehicle']}_lane")
+policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{asked['--vehicle']}_path")
 plant, bound = policy.vehicle, policy.certificate["corridor"]
 loop = {"dt": plant.dt, "observation_noise": bound["conditions"]["sensor_noise"]}
 loop |= {"horizon": 20, "record": {"inside": lambda info: info["shield_healthy"]}}

@@ -59,13 +59,9 @@ def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
     (measured,) = (line for line in text.splitlines() if "not signed" in line)
     assert f"alpha {document['alpha']:.4f}" in proved
     assert f"{document['d_bar']['value']:.3g}" in measured
-    ranges = {
-        "path": ("v_ref [m/s] 8 … 10.5", "curvature [1/m] -0.02 … 0.02", "3 to 6 s"),
-        "lane": ("v_ref [m/s] 3 … 12", "curvature [1/m] -0.05 … 0.05", "3 to 6 s"),
-    }
-    for kind, facts in ranges.items():
-        assert all(fact in text for fact in facts) == vehicle.endswith(kind)
     if "_" in vehicle:
+        for fact in ("v_ref [m/s] 3 … 12", "curvature [1/m] -0.05 … 0.05", "3 to 6 s"):
+            assert fact in text
         assert f"{document['corridor']['corridor_m']:.3f} m" in measured
     assert "nothing is proved" in repr(replace(trained, certificate=None))
 

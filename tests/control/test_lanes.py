@@ -347,7 +347,7 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
         )
 
 
-@pytest.mark.parametrize("name", ["dynamic_lane", "kinematic_path"])
+@pytest.mark.parametrize("name", ["dynamic_path", "kinematic_path"])
 def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
     policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{name}")
     driver, size = policy.in_lane(), len(policy.vehicle.state_names)

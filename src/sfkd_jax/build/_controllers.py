@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -401,24 +400,18 @@ def build_in_lane(
     """
     corridor, road = certificate["corridor"], certificate["boxes"]["control"]
     under, state = corridor["conditions"], _conditions(certificate).state
-    # The sharpest slope of the sinusoids that the roads of the class are made of; one
-    # with lane changes states it.
-    sharpest = 2.0 * math.pi * under["peak_curvature"] / min(under["wavelengths"])
-    turning, fastest = under.get("curvature_slope", sharpest), road[1][REFERENCE_SPEED]
-    # A class of constant speeds was not asked about changes: they are gentle.
-    changes: Any = {}
-    if most := under.get("acceleration"):
-        changes = {"change": most, "deceleration": 0.75 * most}
     kind = control.Class(
         curvature=min(under["peak_curvature"], road[1][CURVATURE]),
-        turning=turning,
+        turning=under["curvature_slope"],
         lateral=min(under["lateral_acceleration"], float(law.high[0])),
-        jerk=under.get("lateral_jerk", turning * fastest**3),
-        speed=(road[0][REFERENCE_SPEED], fastest),
+        jerk=under["lateral_jerk"],
+        speed=(road[0][REFERENCE_SPEED], road[1][REFERENCE_SPEED]),
         half=(0.5 * car[0], 0.5 * car[1]),
         corridor=corridor["corridor_m"],
         heading=0.0 if state is None else max(abs(end[HEADING]) for end in state),
-        **changes,
+        change=under["acceleration"],
+        # The rest is left for what the speed lags behind.
+        deceleration=0.75 * under["acceleration"],
         braking=6.0 if plant.speed_loop else -plant.control_low[1],
     )
     follows = float(np.mean(law.gain[..., 1, PATH_SPEED]))

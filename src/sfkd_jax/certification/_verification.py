@@ -325,21 +325,18 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
     width = bounds["nominal"] + tube
     # Where all bounds held on all runs, nothing farther was seen.
     covered = corridor["coverage"] == 1.0
-    data, kinds = trained.settings["dataset"], (*JOINT, *ALONE)
-    groups = DRIVES if data.get("acceleration") else ()
-    everywhere = max(1, len(groups)) * corridor["runs"]
+    kinds = (*JOINT, *ALONE)
+    everywhere = len(DRIVES) * corridor["runs"]
     bounds_of: dict[str, Any] = {"bounds": dict.fromkeys(kinds, POSITIVE)}
-    claim = bounds_of | _covered(corridor, runs, runs)
-    if groups:
-        parts = [corridor["by_group"][name] for name in groups]
-        rules = [bounds_of | _covered(part, runs, runs) for part in parts]
-        own = [part["bounds"] for part in parts]
-        claim |= {
-            # Each bound is that of its worst group.
-            "bounds": Follows({n: max(each[n] for each in own) for n in kinds}, 0.0),
-            "coverage": Follows(min(part["coverage"] for part in parts)),
-            "by_group": dict(zip(groups, rules, strict=True)),
-        }
+    parts = [corridor["by_group"][name] for name in DRIVES]
+    rules = [bounds_of | _covered(part, runs, runs) for part in parts]
+    own = [part["bounds"] for part in parts]
+    claim = _covered(corridor, runs, runs) | {
+        # Each bound is that of its worst group.
+        "bounds": Follows({n: max(each[n] for each in own) for n in kinds}, 0.0),
+        "coverage": Follows(min(part["coverage"] for part in parts)),
+        "by_group": dict(zip(DRIVES, rules, strict=True)),
+    }
     return {
         "innovations": _innovations(corridor, trained, everywhere),
         "conditions": _conditions(document, trained),

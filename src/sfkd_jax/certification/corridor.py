@@ -140,7 +140,6 @@ def certify_corridor(
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     low, high = data["env_low"], data["env_high"]
     limits = DriveClass(**drive_class(data))
-    names = DRIVES if limits.acceleration else DRIVES[:1]
     excited = {name: data[name] for name in EXCITATION}
     # Streams of their own: the data set's runs must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
@@ -151,7 +150,7 @@ def certify_corridor(
     )
     # Jitted once each: the three parts under the conditions share one program.
     runs_of = partial(
-        _driver, loop, limits, excited, jnp.repeat(jnp.arange(len(names)), runs)
+        _driver, loop, limits, excited, jnp.repeat(jnp.arange(len(DRIVES)), runs)
     )
     kinds = [runs_of(switching)] * 3 + [runs_of(from_s3(steps, dt))]
     simulate = jax.jit(partial(_simulate_nominal, loop))
@@ -161,7 +160,7 @@ def certify_corridor(
         for kind, run_key, key in keys
     ]
     units, calibration, test, s3 = (scores for *_, scores in measured)
-    bounds, shares = _worst_group(names, units, calibration, test, level)
+    bounds, shares = _worst_group(units, calibration, test, level)
     lateral, nominal, _ = measured[2]
     conditions = {
         "env_box": [low, high],
@@ -201,16 +200,11 @@ def certify_corridor(
 
 
 def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a data set that say which drives a corridor is about.
-
-    Data of older versions, and those without groups, have the first four.
-    """
-    names = ROAD_SETTINGS if data.get("acceleration") else ROAD_SETTINGS[:4]
-    return {name: data[name] for name in names}
+    """Return the settings of a data set that say which drives a corridor is about."""
+    return {name: data[name] for name in ROAD_SETTINGS}
 
 
 def _worst_group(
-    names: tuple[str, ...],
     units: np.ndarray,
     calibration: np.ndarray,
     test: np.ndarray,
@@ -218,18 +212,16 @@ def _worst_group(
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """The bounds of the worst group and their coverage; runs are group after group."""
     own, shares = {}, {}
-    parts = [np.split(part, len(names)) for part in (units, calibration, test)]
-    for name, unit, calibrated, _ in zip(names, *parts, strict=True):
+    parts = [np.split(part, len(DRIVES)) for part in (units, calibration, test)]
+    for name, unit, calibrated, _ in zip(DRIVES, *parts, strict=True):
         own[name] = calibrate_corridor(unit, calibrated, level=level)
     bounds = {
         kind: max(each[kind] for each in own.values()) for kind in (*JOINT, *ALONE)
     }
-    for name, part in zip(names, parts[2], strict=True):
+    for name, part in zip(DRIVES, parts[2], strict=True):
         shares[name] = corridor_coverage(bounds, part)
     least = min(shares.values(), key=lambda share: share["coverage"])
-    if len(names) == 1:
-        return bounds, least
-    groups = {name: {"bounds": own[name]} | shares[name] for name in names}
+    groups = {name: {"bounds": own[name]} | shares[name] for name in DRIVES}
     return bounds, least | {"by_group": groups}
 
 

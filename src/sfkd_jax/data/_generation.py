@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import path_state
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.ranges import Interval, NonNegative, Positive, Span
+from sfkd_jax.ranges import Interval, Positive, Span
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.scenarios import (
     DRIVES,
@@ -122,11 +122,11 @@ def generate_along_path(
     *,
     segments: Annotated[int, Interval("[4, inf)")] = 8000,
     steps: int = 50,
-    speed: Span = (8.0, 10.5),
-    peak_curvature: Positive = 0.02,
+    speed: Span = (3.0, 12.0),
+    peak_curvature: Positive = 0.05,
     wavelengths: Span = (50.0, 200.0),
     lateral_acceleration: Positive = 2.0,
-    acceleration: NonNegative = 0.0,
+    acceleration: Positive = 2.0,
     lateral_jerk: Positive = 7.0,
     curvature_slope: Positive = 0.02,
     steering_excitation: Span = (0.002, 0.025),

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 from sfkd_jax.types import Key, Scalar
 
 DRIVES = ("bends", "speeds", "lane_changes")
-"""Groups of drives in which the speed changes: bends at speeds that swing slowly, the
-same with braking and accelerating from any speed to any other, and lane changes.
+"""Groups of drives: bends at speeds that swing slowly, the same with braking and
+accelerating from any speed to any other, and lane changes.
 """
 CHANGE = (3.0, 7.0)
 """Duration of a lane change [s]."""
@@ -30,17 +30,16 @@ class DriveClass(NamedTuple):
         peak_curvature: largest |κ| [1/m].
         wavelengths: of the sinusoids of a road [m].
         lateral_acceleration: a_y, largest v_ref² |κ| [m/s²].
-        acceleration: a_x, with |dv_ref/dt| ≤ a_x √(1 − (v_ref² κ / a_y)²) [m/s²]; 0: no
-            groups, bends at speeds that swing slowly.
-        lateral_jerk: largest v_ref³ |dκ/ds| [m/s³], of the groups.
-        curvature_slope: largest |dκ/ds| [1/m²], of the groups.
+        acceleration: a_x, with |dv_ref/dt| ≤ a_x √(1 − (v_ref² κ / a_y)²) [m/s²].
+        lateral_jerk: largest v_ref³ |dκ/ds| [m/s³].
+        curvature_slope: largest |dκ/ds| [1/m²].
     """
 
-    speed: tuple[float | Scalar, float | Scalar] = (8.0, 10.5)
-    peak_curvature: float = 0.02
+    speed: tuple[float | Scalar, float | Scalar] = (3.0, 12.0)
+    peak_curvature: float = 0.05
     wavelengths: tuple[float, float] = (50.0, 200.0)
     lateral_acceleration: float = 2.0
-    acceleration: float = 0.0
+    acceleration: float = 2.0
     lateral_jerk: float = 7.0
     curvature_slope: float = 0.02
 
@@ -51,7 +50,7 @@ def random_drive(
     """Return v_ref [m/s] and κ [1/m] at every step of a drive.
 
     A third of the roads are circles, the curvature of the others is a sum of three
-    sinusoids. With groups it is a share of the tightest that the speed allows.
+    sinusoids, as a share of the tightest that the speed allows.
 
     Args:
         key: consumed.
@@ -60,8 +59,6 @@ def random_drive(
         steps: of the drive.
         dt: sampling period [s].
     """
-    if not limits.acceleration:
-        return _bends(key, limits, steps=steps, dt=dt)
     speed_key, road_key, change_key = jax.random.split(key, 3)
     wanted, rates = _wanted_speeds(speed_key, group, limits, steps=steps, dt=dt)
     waves, phases, size = _sinusoids(road_key, limits.wavelengths)
@@ -113,29 +110,6 @@ def _swings(
     return jnp.clip(speeds, *limits.speed)
 
 
-def _bends(
-    key: Key, limits: DriveClass, *, steps: int, dt: float
-) -> tuple[Float[Array, " time"], Float[Array, " time"]]:
-    """Speed and curvature of a drive without groups."""
-    level_key, swing_key, wave_key, phase_key, size_key, kind_key, circle_key = (
-        jax.random.split(key, 7)
-    )
-    speeds = _swings(level_key, swing_key, limits, jnp.arange(steps) * dt)
-    waves = _between(wave_key, limits.wavelengths, 3, 1)
-    phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
-    along = jnp.cumsum(speeds) * dt
-    bends = jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases), axis=0)
-    # Three sinusoids seldom peak together: twice their mean, clipped, stays at the
-    # extremes for a while as well.
-    bends = jnp.sqrt(jax.random.uniform(size_key)) * jnp.clip(2.0 * bends, -1.0, 1.0)
-    # Wider than [-1, 1], then clipped: a third of the circles are the tightest.
-    circle = jnp.clip(_between(circle_key, (-1.5, 1.5)), -1.0, 1.0)
-    # A third of the roads are circles: the steady turn is where e_y settles widest.
-    wanted = jnp.where(jax.random.uniform(kind_key) < 1.0 / 3.0, circle, bends)
-    wanted, tightest = limits.peak_curvature * wanted, _tightest(limits, speeds)
-    return speeds, jnp.clip(wanted, -tightest, tightest)
-
-
 def _wanted_speeds(
     key: Key, group: Int[Array, ""], limits: DriveClass, *, steps: int, dt: float
 ) -> tuple[Array, Array]:
@@ -159,7 +133,10 @@ def _wanted_speeds(
 
 
 def _sinusoids(key: Key, wavelengths: tuple[float, float]) -> tuple[Array, ...]:
-    """Wavelengths, phases and size of the sinusoids of a road, or of a circle."""
+    """Wavelengths, phases and size of the sinusoids of a road, or of a circle.
+
+    A third are circles: the steady turn is where e_y settles widest.
+    """
     wave_key, phase_key, size_key, kind_key = jax.random.split(key, 4)
     waves = _between(wave_key, wavelengths, 3)
     phases = jax.random.uniform(phase_key, (3,), maxval=2 * jnp.pi)
@@ -170,7 +147,8 @@ def _sinusoids(key: Key, wavelengths: tuple[float, float]) -> tuple[Array, ...]:
     return (
         jnp.where(circle, jnp.inf, waves),
         jnp.where(circle, side, phases),
-        # A third of the circles are the tightest; see `_bends`.
+        # Three sinusoids seldom peak together: twice their mean, clipped, stays at the
+        # extremes for a while as well. A third of the circles are the tightest.
         jnp.where(circle, jnp.minimum(1.5 * size**2, 1.0), 2.0 * size),
     )
 

@@ -146,13 +146,13 @@ def derive_path_law(
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
     lateral_acceleration: Positive = 2.2,
-    speed: Span = (8.0, 10.5),
-    points: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (13, 3, 7),
+    speed: Span = (3.0, 12.0),
+    points: tuple[AtLeastTwo, AtLeastTwo, AtLeastTwo] = (13, 13, 7),
     perturbation: tuple[Positive, Positive] = (0.03, 1.0),
     lateral: float = 10.0,
     heading: float = 60.0,
     velocity: float = 5.0,
-    curvature: Positive = 300.0,
+    curvature: Positive = 100.0,
     drive: Positive = 0.5,
 ) -> PathLaw:
     """Tabulate steady turns and gains over (v_ref² κ, v_ref, e), from a step alone.
