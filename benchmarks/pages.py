@@ -92,7 +92,7 @@ def shield():
 
     def cells(car, kind):
         kept = rows[car, f"planner {kind}: guard"]
-        free = rows[car, f"planner {kind}: bare"]["left_the_path"]
+        free = rows[car, f"planner {kind}: bare"]["left_the_lane"]
         return [
             f"{free} of {kept['runs']} → {kept['left_the_lane']}",
             f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",
@@ -249,7 +249,7 @@ def peers():
 def wide():
     """What the certificates of the policies for lanes say."""
     about = [
-        read(PRETRAINED / f"{car}_lane/certificate.json")["corridor"] for car in CARS
+        read(PRETRAINED / f"{car}_path/certificate.json")["corridor"] for car in CARS
     ]
     groups = list(about[0]["by_group"])
     lines = [
