@@ -262,7 +262,14 @@ def build_driver(plant: plants.Vehicle) -> Driver:
 
 @takes(control.derive_path_law, skip=("coordinates", "env_low", "env_high"))
 class LawSettings:
-    """The law of path coordinates, as arguments of `derive_path_law`."""
+    """The law of path coordinates, as arguments of `derive_path_law`.
+
+    Attributes:
+        model: whose steps it is derived from: "learned" from runs without a law,
+            "nominal", the textbook bicycle, which knows no e, or "plant", the truth.
+    """
+
+    model: Annotated[str, OneOf(("learned", "nominal", "plant"))] = "plant"
 
 
 def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:

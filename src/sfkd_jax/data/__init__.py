@@ -21,6 +21,7 @@ from sfkd_jax.data._generation import drive_along_path as drive_along_path
 from sfkd_jax.data._generation import from_s3 as from_s3
 from sfkd_jax.data._generation import generate as generate
 from sfkd_jax.data._generation import generate_along_path as generate_along_path
+from sfkd_jax.data._generation import generate_open_loop as generate_open_loop
 from sfkd_jax.data._generation import segment_scenarios as segment_scenarios
 from sfkd_jax.data._generation import sensor_keys as sensor_keys
 from sfkd_jax.data._logs import Columns as Columns

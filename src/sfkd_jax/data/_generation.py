@@ -180,6 +180,71 @@ def generate_along_path(
     )
 
 
+def generate_open_loop(
+    vehicle: Vehicle,
+    key: Key,
+    *,
+    segments: int = 4000,
+    steps: int = 50,
+    speed: Span,
+    lateral_acceleration: Positive,
+    sharpest: Positive = 0.25,
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+) -> Trajectory:
+    """Generate segments without any path or law, to fit a model of the vehicle.
+
+    The steering is about that of a circle, the drive goes from one speed to another,
+    and an AR(1) process excites both. e is held, anywhere in E and at its ends.
+
+    Args:
+        vehicle: the plant.
+        key: consumed.
+        segments: number of them.
+        steps: of a segment.
+        speed: range of the speeds [m/s].
+        lateral_acceleration: of the tightest circles [m/s²].
+        sharpest: largest curvature [1/m].
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+    """
+    low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
+    spreads = jnp.asarray([[0.003, 0.08], [0.1, 1.5]])
+
+    def one(key: Key) -> Trajectory:
+        env_key, speed_key, bend_key, spread_key, noise_key = jax.random.split(key, 5)
+        env = held_road(env_key, steps=1, low=env_low, high=env_high)[0]
+        begin, goal = jax.random.uniform(
+            speed_key, (2,), minval=speed[0], maxval=speed[1]
+        )
+        # Squared: most turns are wide, as on roads, and some as tight as the axes of a
+        # law are long.
+        share = jax.random.uniform(bend_key, (), minval=-1.0)
+        tightest = jnp.minimum(lateral_acceleration / begin**2, sharpest)
+        steering = jnp.arctan(vehicle.wheelbase * share * jnp.abs(share) * tightest)
+        spread = _log_uniform(spread_key, spreads)
+        white = jax.random.normal(noise_key, (steps + SETTLING, 2))
+
+        def step(carry: tuple[State, Array], fresh: Array) -> tuple[Any, Any]:
+            state, noise = carry
+            noise = _coloured(noise, spread, fresh)
+            drive = jnp.clip(0.5 * (goal - state[3]), -2.0, 2.0)
+            drive = goal if vehicle.speed_loop else drive
+            # Faster than at the start, the same circle would need more grip.
+            slower = jnp.minimum(begin / jnp.maximum(state[3], 1.0), 1.0) ** 2
+            control = jnp.stack([slower * steering, drive]) + noise
+            control = jnp.clip(control, low, high)
+            after = vehicle.step(state, control, env)
+            return (after, noise), (after, control)
+
+        start = jnp.zeros(len(vehicle.state_names)).at[3].set(begin)
+        _, (states, controls) = jax.lax.scan(step, (start, spread * white[0]), white)
+        envs = jnp.tile(env, (steps, 1))
+        return Trajectory(states[SETTLING - 1 :], controls[SETTLING:], envs)
+
+    return in_batches(one, jax.random.split(key, segments), size=BATCH)
+
+
 def segment_scenarios(
     segments: int, *, along_path: bool = False
 ) -> Int[np.ndarray, " segment"]:

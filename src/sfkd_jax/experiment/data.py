@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,17 +26,25 @@ from sfkd_jax.data import (
     from_logs,
     generate,
     generate_along_path,
+    generate_open_loop,
+    measure_space,
+    random_windows,
     segment_scenarios,
     split,
+    spread_windows,
 )
 from sfkd_jax.experiment.options import LogSettings, Settings
+from sfkd_jax.models import one_step
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.settings import arguments, plain
-from sfkd_jax.types import BODY, Key, Trajectory
+from sfkd_jax.training import descend, one_step_loss
+from sfkd_jax.types import BODY, Key, Step, Trajectory
 
 DATASET, LAW = "dataset", "law"
-SWITCHING = 2
-"""Stream folded into the data set's seed; simulation and split use streams 0 and 1."""
+SWITCHING, OPEN_LOOP = 2, 3
+"""Streams folded into the data set's seed; simulation and split use 0 and 1."""
+REGRESSION = 16_000
+"""Optimiser steps of the model that a law is derived from."""
 
 
 def config(settings: Settings) -> dict[str, Any]:
@@ -192,19 +201,76 @@ def ensure_law(settings: Settings) -> PathLaw | None:
         return None
     path, about = dataset_path(settings).with_name("law.safetensors"), config(settings)
     if not path.is_file():
-        plant = build.build_vehicle(settings.vehicle)
-        store.print_message(f"deriving the law of vehicle {plant.name}")
-        box: Any = settings.environment.box
-        derive = partial(
-            derive_path_law,
-            plant.step,
-            coordinates=len(plant.state_names) - 1,
-            **{name: tuple(map(float, ends)) for name, ends in box.items()},
-            **arguments(settings.along_path.law, derive_path_law),
-        )
-        law = jax.device_get(jax.jit(derive)())._asdict()
-        store.write_arrays(path, law, kind=LAW, config=about)
+        law = jax.device_get(derive_law(settings))
+        store.write_arrays(path, law._asdict(), kind=LAW, config=about)
     return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
+
+
+def derive_law(settings: Settings) -> PathLaw:
+    """Derive the law of the data set from the model that its settings name.
+
+    Raises:
+        ValueError: the law of a learned model does not hold the vehicle on its paths.
+    """
+    along: Any = settings.along_path
+    plant = build.build_vehicle(settings.vehicle)
+    steps = {"plant": lambda: plant.step, "nominal": lambda: plant.nominal}
+    steps["learned"] = partial(_learned_step, settings, plant)
+    step = steps[along.law.model]()
+    store.print_message(
+        f"deriving the law of vehicle {plant.name} from its {along.law.model} model"
+    )
+    box: Any = settings.environment.box
+    derive = partial(
+        derive_path_law,
+        step,
+        coordinates=len(plant.state_names) - 1,
+        **{name: tuple(map(float, ends)) for name, ends in box.items()},
+        **arguments(along.law, derive_path_law),
+    )
+    law = jax.jit(derive)()
+    return law
+
+
+def _learned_step(settings: Settings, plant: Vehicle) -> Step:
+    """The step of a regression of runs without a law, over the axes of the law."""
+    law, box = settings.along_path.law, settings.environment.box  # pyright: ignore
+    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP)
+    run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
+    begun = time.perf_counter()
+    runs = jax.jit(
+        partial(
+            generate_open_loop,
+            plant,
+            # A little beyond the axes, at whose ends steady turns are sought.
+            speed=(0.8 * law.speed[0], 1.1 * law.speed[1]),
+            lateral_acceleration=1.2 * law.lateral_acceleration,
+            **box,
+        )
+    )(run_key)
+    dataset = split(
+        runs,
+        split_key,
+        shares=(0.9, 0.05, 0.025, 0.025),
+        env_low=jnp.asarray(settings.environment.low),
+        env_high=jnp.asarray(settings.environment.high),
+        scenarios=jnp.zeros(runs.controls.shape[0], jnp.int32),
+    )
+    model = one_step(measure_space(dataset))
+    identify: Any = model.fitting.identify
+    start = jax.jit(identify)(dataset.train, dataset.validation, start_key)
+    loss, draw = one_step_loss(model), partial(random_windows, batch=512, length=1)
+    params = descend(start, loss, draw, dataset.train, fit_key, steps=REGRESSION)
+    held_out = spread_windows(dataset.test, length=1)
+    linear, left = (float(loss.validate(one, held_out)[0]) for one in (start, params))
+    store.print_message(
+        f"fitted a model of vehicle {plant.name} to {runs.controls.shape[0]} runs in "
+        f"{time.perf_counter() - begun:.0f} s; of what least squares leaves, "
+        f"{100 * math.sqrt(left / linear):.1f} % is left"
+    )
+    return lambda state, control, env: model.step(
+        model.fiber(params, env), state, control
+    )
 
 
 def closed_loop(settings: Settings) -> Vehicle:

@@ -1,6 +1,7 @@
 """Rollout models: listed by name in `FACTORIES`."""
 
 from sfkd_jax.models._continuous import neural_ode as neural_ode
+from sfkd_jax.models._continuous import one_step as one_step
 from sfkd_jax.models._continuous import physics as physics
 from sfkd_jax.models._continuous import state_model as state_model
 from sfkd_jax.models._control_synth import control_synth as control_synth

@@ -10,21 +10,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import rotate
+from sfkd_jax.geometry import between, compose, rotate
 from sfkd_jax.models._networks import FRAMES
 from sfkd_jax.ranges import check_choice
 from sfkd_jax.rollout import runge_kutta
 from sfkd_jax.types import (
     BODY,
+    POSE,
     Control,
     Environment,
     Fiber,
+    Fitting,
     Key,
     Model,
     Params,
     Space,
     State,
     Step,
+    Trajectory,
 )
 
 
@@ -171,6 +174,61 @@ def continuous(
         state_size=3 + space.body_mean.shape[0],
         along_path=not pose,
     )
+
+
+def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
+    """Return a regression of one step: linear by least squares, a network for the rest.
+
+        (Δ, s⁺ − s) = Wᵀ [1; s; u; e] + σ tanh network(s, u, e),   Δ in the body frame
+
+    `fitting.identify` finds W and σ, the spread of what W leaves; it starts the network,
+    whose weights are the only ones that a gradient reaches.
+
+    Args:
+        space: measured scales; fixes all sizes.
+        hidden: widths.
+    """
+    outputs = 3 + space.body_mean.shape[0]
+    network = mlp(hidden, outputs, (nn.tanh,) * len(hidden), last=0.1)
+
+    def inputs(state: State, control: Control, env: Environment) -> Array:
+        parts = space.scaled_body(state), space.scaled_control(control)
+        return jnp.concatenate([*parts, space.scaled_env(env)])
+
+    def identify(train: Trajectory, held_out: Trajectory, key: Key) -> Params:
+        del held_out
+        before, after = train.states[:, :-1], train.states[:, 1:]
+        read = jax.vmap(jax.vmap(inputs))(before, train.controls, train.envs)
+        read = read.reshape(-1, read.shape[-1])
+        moved = jax.vmap(jax.vmap(_increment))(before, after).reshape(-1, outputs)
+        columns = jnp.column_stack([jnp.ones(read.shape[0]), read])
+        # Scaled inputs: the normal equations are well conditioned, also in float32.
+        gram = columns.T @ columns + 1e-3 * jnp.eye(columns.shape[1])
+        linear = jnp.linalg.solve(gram, columns.T @ moved)
+        scale = jnp.std(moved - columns @ linear, axis=0)
+        return {
+            "linear": linear,
+            "scale": jnp.where(scale > 1e-6, scale, 1e-6),
+            "network": network.init(key, read[0])["params"],
+        }
+
+    def step(fiber: Conditioned, state: State, control: Control) -> State:
+        read = inputs(state, control, fiber.env)
+        fixed = jax.lax.stop_gradient(fiber.params)
+        rest = network.apply({"params": fiber.params["network"]}, read)
+        linear = fixed["linear"][0] + read @ fixed["linear"][1:]
+        change = linear + fixed["scale"] * cast(jax.Array, rest)
+        pose = compose(state[POSE], change[POSE])
+        return jnp.concatenate([pose, state[BODY] + change[BODY]])
+
+    model = state_model(lambda key: {}, Conditioned, step, vector=space.scaled_body)
+    return model._replace(fitting=Fitting(identify=identify))
+
+
+def _increment(before: State, after: State) -> State:
+    """The motion in the frame of the car, and the change of the body state."""
+    pose = between(before[POSE], after[POSE])
+    return jnp.concatenate([pose, after[BODY] - before[BODY]])
 
 
 def mlp(

@@ -152,6 +152,33 @@ def fit(
         checkpoints.close()
 
 
+def descend(
+    params: Params,
+    loss: Loss,
+    draw: Draw,
+    data: Trajectory,
+    key: Key,
+    *,
+    steps: int,
+    learning_rate: Positive = 3e-3,
+) -> Params:
+    """Train for seconds, in one program and without a directory; else as `fit`.
+
+    Args:
+        params: where to start.
+        loss: see `one_step_loss`.
+        draw: (data, key) -> a batch of windows.
+        data: the training trajectories.
+        key: for the batches.
+        steps: optimiser steps.
+        learning_rate: the largest.
+    """
+    transform, schedule = _optimizer(steps, learning_rate, 100.0)
+    advance = _chunk(loss, transform, schedule, draw, length=steps)
+    start = TrainState(jnp.zeros((), jnp.int32), params, transform.init(params))
+    return advance(start, data, key)[0].params
+
+
 def _begin(model: Model, transform: Any, key: Key) -> TrainState:
     """The state before the first step."""
     params = model.init(key)

@@ -151,6 +151,25 @@ def multi_step_loss(
     return Loss(evaluate, jax.jit(evaluate))
 
 
+def one_step_loss(model: Model) -> Loss:
+    """Return the mean square error of single steps, relative to their "scale".
+
+    That is an entry of the parameters, see `models.one_step`: what least squares left.
+    """
+
+    def error(params: Params, data: Trajectory) -> Scalar:
+        after = rollout(model, params, data)[0]
+        # In the frame of the car, as the scale is.
+        gap = state_errors(after, data.states[1:])
+        return jnp.mean((gap / jax.lax.stop_gradient(params["scale"])) ** 2)
+
+    def evaluate(params: Params, batch: Trajectory) -> Evaluated:
+        errors = jax.vmap(error, in_axes=(None, 0))(params, batch)
+        return jnp.mean(errors), {}, errors
+
+    return Loss(evaluate, jax.jit(evaluate))
+
+
 def _window_parts(
     model: Model,
     space: Space,
