@@ -1,5 +1,6 @@
 """A law derived from a plant's step: it stabilises the car and can be stored."""
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -7,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from composing import settings
 from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import plants, policy
 from sfkd_jax.control import derive_path_law
+from sfkd_jax.experiment import data
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
@@ -131,6 +134,31 @@ def test_the_law_brakes_to_a_standstill_and_stays_there():
     track = np.asarray(jit(lambda x: jax.lax.scan(step, x, length=300)[1])(start))
     assert np.max(np.abs(track[:, 0])) < 0.2
     assert np.max(np.abs(track[100:, 2])) < 1e-3
+
+
+LEARNED = (
+    *("+experiment=s3", "dataset.law.model=learned", "dataset.law.points=[7,2,3]"),
+    *("dataset.speed=[8,10]", "dataset.law.speed=[8,10]"),
+)
+
+
+def test_a_law_of_a_model_fitted_to_runs_without_a_law_holds_the_car(
+    monkeypatch, capsys
+):
+    """Or is refused: a bad model promises what the car does not keep."""
+    monkeypatch.setattr(data, "REGRESSION", 1500)
+    chosen, true = settings(*LEARNED), settings(*LEARNED, "dataset.law.model=plant")
+    law, known = data.derive_law(chosen), data.derive_law(true)
+    says = r"within ([\d.]+) mm \(RMS\) of its paths, the model promises ([\d.]+) mm"
+    found, promised = map(float, re.search(says, capsys.readouterr().err).groups())
+    assert found < 1.2 * promised
+    # Where the tyres hold; at the ends of the axes no turn may exist.
+    gap = np.abs(law.control[2:5, ..., 0] - known.control[2:5, ..., 0])
+    assert np.mean(gap) < 2e-3
+    monkeypatch.setattr(data, "REGRESSION", 1)
+    with pytest.raises(ValueError, match="fitted badly") as refused:
+        data.derive_law(chosen)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.exhaustive

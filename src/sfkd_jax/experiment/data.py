@@ -41,8 +41,12 @@ from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import BODY, Key, Step, Trajectory
 
 DATASET, LAW = "dataset", "law"
-SWITCHING, OPEN_LOOP = 2, 3
+SWITCHING, OPEN_LOOP, ALONE = 2, 3, 4
 """Streams folded into the data set's seed; simulation and split use 0 and 1."""
+QUIET = (1e-6, 2e-6)
+"""Excitation of the law alone: none, but with a logarithm."""
+STRAYS, SLACK = 1.5, 5.0
+"""A law is accepted up to this factor of what its model promises, and so many mm."""
 REGRESSION = 16_000
 """Optimiser steps of the model that a law is derived from."""
 
@@ -229,7 +233,40 @@ def derive_law(settings: Settings) -> PathLaw:
         **arguments(along.law, derive_path_law),
     )
     law = jax.jit(derive)()
+    if along.law.model != "plant":
+        _check_law(settings, plant, law, step)
     return law
+
+
+def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> None:
+    """Drive the vehicle by the law alone, beside the model that it was derived from.
+
+    Where the vehicle strays much farther than the model, the model is not that of the
+    vehicle: a learned one is refused, the textbook's is what was asked for.
+    """
+    quiet = dict.fromkeys(("steering_excitation", "speed_excitation"), QUIET)
+    options = arguments(settings.dataset, generate_along_path) | quiet
+    options |= {"segments": 240, "steps": 100, **settings.environment.box}
+    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), ALONE)
+
+    def lateral(step: Step) -> float:
+        loop = build.build_loop(plant._replace(step=step), law)
+        runs = jax.jit(partial(generate_along_path, loop, **options))(seed)
+        return 1e3 * float(jnp.sqrt(jnp.mean(runs.states[..., BODY.start] ** 2)))
+
+    found, promised = lateral(plant.step), lateral(step)
+    name = settings.along_path.law.model  # pyright: ignore
+    line = (
+        f"the law of the {name} model keeps vehicle {plant.name} within {found:.1f} mm "
+        f"(RMS) of its paths, the model promises {promised:.1f} mm"
+    )
+    # Not `>`: NaN is no law.
+    if not found <= STRAYS * promised + SLACK and name == "learned":
+        raise ValueError(
+            f"{line}: it was fitted badly; narrow dataset.law.speed or "
+            "dataset.law.lateral_acceleration, or pass dataset.law.model=plant"
+        )
+    store.print_message(line)
 
 
 def _learned_step(settings: Settings, plant: Vehicle) -> Step:

@@ -181,8 +181,8 @@ def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
 
         (Δ, s⁺ − s) = Wᵀ [1; s; u; e] + σ tanh network(s, u, e),   Δ in the body frame
 
-    `fitting.identify` finds W and σ, the spread of what W leaves; it starts the network,
-    whose weights are the only ones that a gradient reaches.
+    `fitting.identify` finds W and σ, the spread of what W leaves, and starts the
+    network, whose weights are the only ones that a gradient reaches.
 
     Args:
         space: measured scales; fixes all sizes.
