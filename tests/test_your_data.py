@@ -73,8 +73,8 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     assert document["results"] is None
     assert "not driven" in done.stderr
     errors = json.loads((logs.parent / document["run"] / "open_loop.json").read_text())
-    assert set(errors["baselines"]) == {"kinematic_bicycle", "fitted_bicycle"}
-    fitted = errors["baselines"]["fitted_bicycle"]["position_rmse_m"]
+    assert set(errors["baselines"]) == {"kinematic_bicycle", "least_squares"}
+    fitted = errors["baselines"]["least_squares"]["position_rmse_m"]
     assert len(fitted) == len(errors["position_rmse_m"]) == 5
     certificate = json.loads((logs.parent / document["certificate"]).read_text())
     assert certificate["valid"]

@@ -2,14 +2,13 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import dataset, driven, jit, model_and_params
 
 from sfkd_jax import evaluation, models, plants
-from sfkd_jax.evaluation import FittedBicycle
+from sfkd_jax.experiment.data import least_squares
 from sfkd_jax.types import Trajectory
 
 DT = 0.1
@@ -43,46 +42,13 @@ def test_errors_along_and_across_mean_the_same_on_every_heading():
     )
 
 
-def rolled(step, start, controls):
-    """One trajectory of a step function, as a batch."""
-
-    def advance(state, control):
-        after = step(state, control, jnp.zeros(2))
-        return after, after
-
-    _, states = jit(partial(jax.lax.scan, advance))(start, controls)
-    states = jnp.concatenate([start[None], states])
-    envs = jnp.zeros((len(controls), 2))
-    return jax.tree.map(lambda leaf: leaf[None], Trajectory(states, controls, envs))
-
-
-@pytest.mark.parametrize(
-    ("curvature", "slip", "spread", "is_angle"),
-    [
-        ([0.01, 1 / 2.9], [0.02, 1.3], [0.1, 1.0], True),
-        ([0.0, 1e-3], [0.0, 0.0], [30.0, 0.5], False),
-    ],
-)
-def test_the_fit_finds_the_parameters_of_a_bicycle(curvature, slip, spread, is_angle):
-    """The second is a robot whose first control is its curvature in 1/km."""
-    given = ([0.1, 0.8, -0.05], curvature, slip)
-    true = FittedBicycle(*map(np.asarray, given), is_angle, DT)
-    noise = jax.random.normal(jax.random.key(0), (400, 2)) * jnp.asarray(spread)
-    data = rolled(true.step, jnp.asarray([0.0, 0.0, 0.2, 9.0]), noise)
-    fitted = FittedBicycle.fit(data, dt=DT)
-    assert fitted.is_angle is is_angle
-    for name in ("acceleration", "curvature", "slip"):
-        result, wanted = getattr(fitted, name), getattr(true, name)
-        np.testing.assert_allclose(result, wanted, rtol=2e-2, atol=2e-3)
-
-
-def test_the_fitted_bicycle_errs_less_than_the_nominal_one():
+def test_least_squares_errs_less_than_the_nominal_bicycle():
     data, horizon = dataset(), 10
-    fitted = models.physics(FittedBicycle.fit(data.train, dt=DT).step)
-    known = models.physics(plants.kinematic().nominal)
     both = [
-        jit(partial(evaluation.open_loop, each, horizon=horizon))({}, data.test)
-        for each in (fitted, known)
+        jit(partial(evaluation.open_loop, models.physics(step), horizon=horizon))(
+            {}, data.test
+        )
+        for step in (least_squares(data), plants.kinematic().nominal)
     ]
     ours, nominal = (np.hypot(*np.asarray(each)[-1, :2]) for each in both)
     assert ours < 0.9 * nominal

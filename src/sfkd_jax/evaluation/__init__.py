@@ -8,7 +8,6 @@ from sfkd_jax.evaluation._closed_loop import (
     observed_environment as observed_environment,
 )
 from sfkd_jax.evaluation._closed_loop import simulate as simulate
-from sfkd_jax.evaluation._open_loop import FittedBicycle as FittedBicycle
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores

@@ -38,7 +38,7 @@ from sfkd_jax.models import one_step
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.settings import arguments, plain
 from sfkd_jax.training import descend, one_step_loss
-from sfkd_jax.types import BODY, Key, Step, Trajectory
+from sfkd_jax.types import BODY, Key, Model, Step, Trajectory
 
 DATASET, LAW = "dataset", "law"
 SWITCHING, OPEN_LOOP, ALONE = 2, 3, 4
@@ -271,7 +271,8 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
 
 def _learned_step(settings: Settings, plant: Vehicle) -> Step:
     """The step of a regression of runs without a law, over the axes of the law."""
-    law, box = settings.along_path.law, settings.environment.box  # pyright: ignore
+    along, box = settings.along_path, settings.environment.box
+    law: Any = along and along.law
     seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
     begun = time.perf_counter()
@@ -293,9 +294,7 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
         env_high=jnp.asarray(settings.environment.high),
         scenarios=jnp.zeros(runs.controls.shape[0], jnp.int32),
     )
-    model = one_step(measure_space(dataset))
-    identify: Any = model.fitting.identify
-    start = jax.jit(identify)(dataset.train, dataset.validation, start_key)
+    model, start = _identified(dataset, start_key)
     loss, draw = one_step_loss(model), partial(random_windows, batch=512, length=1)
     params = descend(start, loss, draw, dataset.train, fit_key, steps=REGRESSION)
     held_out = spread_windows(dataset.test, length=1)
@@ -305,6 +304,24 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
         f"{time.perf_counter() - begun:.0f} s; of what least squares leaves, "
         f"{100 * math.sqrt(left / linear):.1f} % is left"
     )
+    return _step_of(model, params)
+
+
+def least_squares(dataset: Dataset) -> Step:
+    """Return the best linear model of one step, of the training part of a data set."""
+    model, params = _identified(dataset, jax.random.key(0))
+    # Without a scale the network, which nothing has trained yet, has no say.
+    return _step_of(model, params | {"scale": 0.0 * params["scale"]})
+
+
+def _identified(dataset: Dataset, key: Key) -> tuple[Model, Any]:
+    """The model of one step, and its parameters before any training."""
+    model = one_step(measure_space(dataset))
+    identify: Any = model.fitting.identify
+    return model, jax.jit(identify)(dataset.train, dataset.validation, key)
+
+
+def _step_of(model: Model, params: Any) -> Step:
     return lambda state, control, env: model.step(
         model.fiber(params, env), state, control
     )

@@ -23,7 +23,7 @@ from sfkd_jax.data import (
     random_windows,
     spread_windows,
 )
-from sfkd_jax.evaluation import FittedBicycle, open_loop
+from sfkd_jax.evaluation import open_loop
 from sfkd_jax.experiment import data, runs
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.models import physics
@@ -168,16 +168,16 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
 def _open_loop_document(
     settings: Settings, model: Model, params: Params, dataset: Dataset
 ) -> dict[str, Any]:
-    """The content of open_loop.json: errors by steps ahead, and those of bicycles."""
+    """The content of open_loop.json: errors by steps ahead, and of simple models."""
     along, horizon = settings.along_path is not None, settings.training.window
     plant = (
         data.closed_loop(settings) if along else build.build_vehicle(settings.vehicle)
     )
-    bicycles = {"kinematic_bicycle": plant.nominal}
-    # Controls along a path are perturbations of a law: no bicycle explains them.
+    simple = {"kinematic_bicycle": plant.nominal}
+    # Controls along a path are perturbations of a law, which is not linear.
     if not along:
-        bicycles["fitted_bicycle"] = FittedBicycle.fit(dataset.train, dt=plant.dt).step
-    others = {name: physics(step, along_path=along) for name, step in bicycles.items()}
+        simple["least_squares"] = data.least_squares(dataset)
+    others = {name: physics(step, along_path=along) for name, step in simple.items()}
 
     @jax.jit
     def errors(params: Params, test: Trajectory) -> tuple[jax.Array, dict[str, Any]]:
@@ -198,13 +198,13 @@ def _open_loop_document(
             "speed_rmse_m_per_s": speed.tolist(),
         }
 
-    own, of_bicycles = errors(params, dataset.test)
+    own, of_others = errors(params, dataset.test)
     return {
         "steps": list(range(1, horizon + 1)),
         "dt": plant.dt,
         "trajectories": dataset.test.controls.shape[0],
         **columns(own),
-        "baselines": {name: columns(one) for name, one in of_bicycles.items()},
+        "baselines": {name: columns(one) for name, one in of_others.items()},
     }
 
 
