@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, NamedTuple, TypeAlias
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
@@ -17,9 +16,9 @@ from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std
 from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
-from sfkd_jax.plants import Vehicle, dynamic
+from sfkd_jax.plants import Vehicle, dynamic, simulator
 from sfkd_jax.ranges import check_choice
-from sfkd_jax.types import Control, Controller, Environment, State, Step
+from sfkd_jax.types import Controller, State
 
 SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
 ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
@@ -88,7 +87,7 @@ MODELS = {
 def commonroad_vehicle(
     *, model: str = "std", car: int = 2, dt: float = 0.1, wind_force: float = 10.0
 ) -> Vehicle:
-    """Return a car of CommonRoad as a plant.
+    """Return a car of CommonRoad as a plant, see `plants.simulator`.
 
     x = (p_x, p_y, yaw, v, v_y, yaw rate, δ | hidden), the first seven as in
     `plants.dynamic`, p at the centre of mass. Hidden states are wheel speeds, and of
@@ -102,10 +101,8 @@ def commonroad_vehicle(
     tyres' lateral force peaks at friction × load (1.0489 in CommonRoad's tyre), the
     longitudinal one in proportion.
 
-    A step is a host callback: it works under `jit`, `vmap` and `scan`, one car after
-    the other, without a gradient. The equations are not valid below a forward speed of
-    0.5 m/s or when a wheel of the multi-body car turns backwards in a spin; from there
-    on the state is NaN.
+    The equations are not valid below a forward speed of 0.5 m/s or when a wheel of the
+    multi-body car turns backwards in a spin; from there on the state is NaN.
 
     Args:
         model: "std", single track with drift (9 states), or "mb", multi-body (29
@@ -121,21 +118,14 @@ def commonroad_vehicle(
         raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
     if not dt > 0:
         raise ValueError(f"dt must be positive, got {dt}")
-    dry: Car = setup_vehicle_parameters(car)
-    host = _HostCar(MODELS[model], dry, dt, wind_force)
-    # The nominal model is that of our dynamic car with these axle distances.
-    bicycle = dynamic(
-        dt=dt, wind_force=wind_force, front_length=dry.a, rear_length=dry.b
-    )
-    hidden = (f"hidden_{index}" for index in host.equations.hidden)
-    return bicycle._replace(
-        name=f"commonroad_{model}",
-        state_names=(*bicycle.state_names, *hidden),
-        step=_on_host(host.step),
-        derivative=_on_host(host.derivative),
-        nominal=_seven(bicycle.nominal),
-        nominal_derivative=_seven(bicycle.nominal_derivative),
-    )
+    plant = simulator(_makes(model, car, dt, wind_force))
+    return plant._replace(name=f"commonroad_{model}")
+
+
+@cache
+def _makes(*settings: Any) -> Callable[[], _HostCar]:
+    """One function for equal settings, so that they share their workers."""
+    return partial(_HostCar, *settings)
 
 
 def commonroad_controller(controller: Controller) -> Controller:
@@ -147,14 +137,25 @@ def commonroad_controller(controller: Controller) -> Controller:
     return controller._replace(act=act)
 
 
-@dataclass(frozen=True)
 class _HostCar:
-    """A car whose equations run on the host; `dry` are its parameters on a dry road."""
+    """A car whose equations run on the host, as a simulator.
 
-    equations: Equations
-    dry: Car
-    dt: float
-    wind_force: float
+    Attributes:
+        dry: its parameters on a dry road.
+    """
+
+    def __init__(self, model: str, car: int, dt: float, wind_force: float) -> None:
+        self.equations, self.dt, self.wind_force = MODELS[model], dt, wind_force
+        self.dry: Car = setup_vehicle_parameters(car)
+        ours = dynamic()
+        self.control_low, self.control_high = ours.control_low, ours.control_high
+        self.wheelbase = self.dry.a + self.dry.b
+        hidden = (f"hidden_{index}" for index in self.equations.hidden)
+        self.state_names = (*ours.state_names, *hidden)
+
+    def reset(self, state: Numbers) -> None:
+        """Put the car into a state."""
+        self.state = list(map(float, state))
 
     def flow(self, control: Numbers, env: Numbers) -> Callable[[Any], list[float]]:
         """Return x -> dx/dt in CommonRoad's coordinates."""
@@ -176,11 +177,8 @@ class _HostCar:
 
         return rates
 
-    def step(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
-        """Return the state one sampling period later, NaN where equations end."""
-        lost = [math.nan] * len(state)
-        if not (all(map(math.isfinite, state)) and state[3] > SLOWEST):
-            return lost
+    def step(self, control: Numbers, env: Numbers) -> list[float]:
+        """Return the state one sampling period later."""
         # In double precision: a wheel settles a hundred times faster than dt.
         flow, velocity = self.flow(control, env), self.equations.velocity
 
@@ -189,26 +187,21 @@ class _HostCar:
             return velocity(x)[0] - SLOWEST
 
         too_slow.terminal = True  # type: ignore[attr-defined]
-        try:
-            solution = solve_ivp(
-                lambda time, x: flow(x),
-                (0.0, self.dt),
-                self.to_commonroad(state),
-                events=too_slow,
-                **ACCURACY,
-            )
+        ended = ValueError(f"the equations end at a forward speed of {SLOWEST} m/s")
+        if self.state[3] <= SLOWEST:
+            raise ended
         # The multi-body car divides by the speed of a wheel, which is held at 0 when it
-        # rolls backwards.
-        except ArithmeticError:
-            return lost
-        return lost if solution.status != 0 else self.from_commonroad(solution.y[:, -1])
-
-    def derivative(self, state: Numbers, control: Numbers, env: Numbers) -> list[float]:
-        """Return dx/dt by a central difference along the flow."""
-        x = self.to_commonroad(state)
-        little = 1e-6 * np.asarray(self.flow(control, env)(x))
-        ahead, behind = map(self.from_commonroad, (x + little, x - little))
-        return ((np.asarray(ahead) - np.asarray(behind)) / 2e-6).tolist()
+        # rolls backwards: that is an ArithmeticError.
+        solution = solve_ivp(
+            lambda time, x: flow(x),
+            (0.0, self.dt),
+            self.to_commonroad(self.state),
+            events=too_slow,
+            **ACCURACY,
+        )
+        if solution.status != 0:
+            raise ended
+        return self.from_commonroad(solution.y[:, -1])
 
     def to_commonroad(self, state: Numbers) -> np.ndarray:
         """Return CommonRoad's x, the settled one plus the hidden part of the state."""
@@ -235,30 +228,3 @@ class _HostCar:
         core = [x, y, steering, speed, yaw, yaw_rate, slip]
         # CommonRoad writes some of them as integers.
         return list(map(float, self.equations.settled(core, self.dry)))
-
-
-def _on_host(function: Callable[[Numbers, Numbers, Numbers], list[float]]) -> Step:
-    """A function of lists as a step of arrays."""
-
-    def call(*inputs: Any) -> np.ndarray:
-        lists = (np.asarray(each).tolist() for each in inputs)
-        return np.asarray(function(*lists), dtype=inputs[0].dtype)
-
-    def step(state: State, control: Control, env: Environment) -> State:
-        # One car after the other: the equations take lists of numbers.
-        shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
-        return jax.pure_callback(
-            call, shape, state, control, env, vmap_method="sequential"
-        )
-
-    return step
-
-
-def _seven(step: Step) -> Step:
-    """A step of the first seven states; hidden ones stay at 0."""
-
-    def wider(state: State, control: Control, env: Environment) -> State:
-        after = step(state[:OBSERVED], control, env)
-        return jnp.zeros_like(state).at[:OBSERVED].set(after)
-
-    return wider

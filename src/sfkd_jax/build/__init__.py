@@ -66,9 +66,10 @@ class VehicleSettings:
 
 @takes()
 class OwnVehicleSettings(VehicleSettings):
-    """An own vehicle, with its step as package.module:function."""
+    """An own vehicle, with its step or its simulator as package.module:function."""
 
     step: str | None = None
+    env: str | None = None
 
 
 VEHICLES = {
@@ -90,6 +91,8 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     if (name := options.get("step")) is not None:
         # At the call: a plant may be described where its code is not installed.
         options["step"] = lambda *inputs: imported(name, "vehicle.step")(*inputs)
+    if (simulator := getattr(settings, "env", None)) is not None:
+        options["step"] = plants.on_host(simulator)
     plant = factory(**options)
     if settings.inner_loop == "none":
         return plant
@@ -97,7 +100,7 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     return plants.with_speed_loop(plant, gain=settings.speed_gain)
 
 
-@takes(scenarios.scenario, skip=("state_size", "dt", "duration"))
+@takes(scenarios.scenario, skip=("state_size", "dt", "duration", "env_low", "env_high"))
 class ScenarioSettings:
     """Friction, wind and road, as arguments of `scenario`."""
 
@@ -105,13 +108,23 @@ class ScenarioSettings:
 
 
 def build_scenario(
-    settings: ScenarioSettings | Values, plant: plants.Vehicle, *, duration: float
+    settings: ScenarioSettings | Values,
+    plant: plants.Vehicle,
+    *,
+    duration: float,
+    env_low: tuple[float, ...] | None = None,
+    env_high: tuple[float, ...] | None = None,
 ) -> scenarios.Family:
-    """Return the scenario family of the settings, with episodes of a duration [s]."""
+    """Return the scenario family of the settings, with episodes of a duration [s].
+
+    Its environments are in the box E, by default in that of the benchmark.
+    """
     settings = parse(ScenarioSettings, settings, "scenario.")
     return scenarios.scenario(
         **arguments(settings, scenarios.scenario),
         duration=duration,
+        env_low=env_low or scenarios.BOX[0],
+        env_high=env_high or scenarios.BOX[1],
         state_size=len(plant.state_names),
         dt=plant.dt,
     )

@@ -16,10 +16,12 @@ from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import Interval, Positive, Span
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.scenarios import (
+    BOX,
     DRIVES,
     DriveClass,
     family,
     held_road,
+    in_box,
     project,
     random_drive,
     random_switching,
@@ -78,6 +80,8 @@ def generate(
     speed_excitation: Span = (0.1, 1.5),
     fixed_levels: bool = False,
     held_out: bool = False,
+    env_low: tuple[float, ...] = BOX[0],
+    env_high: tuple[float, ...] = BOX[1],
 ) -> Trajectory:
     """Generate independent segments in the world: half of them uniform, half wet.
 
@@ -95,16 +99,21 @@ def generate(
         fixed_levels: use the levels of the benchmark's S1 and S2 only (the training
             set as printed in the paper).
         held_out: whether e follows S3 from a random time instead, for tests.
+        env_low: lower corner of E, which the levels are moved into by `in_box`.
+        env_high: upper corner of E.
 
     Returns:
         A batch of trajectories, states (segment, steps + 1, state); their scenarios are
         those of `segment_scenarios`.
     """
     excitation = jnp.asarray([steering_excitation, speed_excitation])
-    schedules = _schedules(steps, vehicle.dt, fixed_levels=fixed_levels)
+    schedules = _schedules(
+        steps, vehicle.dt, env_low, env_high, fixed_levels=fixed_levels
+    )
     planned = _planned(key, schedules, _counts(segments, along_path=False))
     if held_out:
-        planned = [(from_s3(steps, vehicle.dt), jax.random.split(key, segments))]
+        s3 = from_s3(steps, vehicle.dt, env_low, env_high)
+        planned = [(s3, jax.random.split(key, segments))]
     parts = [
         jax.lax.map(
             partial(_segment, vehicle, driver, conditions, steps, speed, excitation),
@@ -151,7 +160,7 @@ def generate_along_path(
         A batch of trajectories, states (segment, steps + 1, 3 + coordinate), controls w
         (segment, steps, 4); their scenarios are those of `segment_scenarios`.
     """
-    schedules = _schedules(steps, loop.dt)
+    schedules = _schedules(steps, loop.dt, env_low, env_high)
     box: dict[str, Any] = {"steps": steps, "low": env_low, "high": env_high}
     schedules["held"] = partial(held_road, **box)
     schedules["switching"] = partial(
@@ -160,7 +169,8 @@ def generate_along_path(
     env_key, run_key = jax.random.split(key)
     planned = _planned(env_key, schedules, _counts(segments, along_path=True))
     if held_out:
-        planned = [(from_s3(steps, loop.dt), jax.random.split(env_key, segments))]
+        s3 = from_s3(steps, loop.dt, env_low, env_high)
+        planned = [(s3, jax.random.split(env_key, segments))]
     envs = [jax.vmap(conditions)(keys) for conditions, keys in planned]
     return drive_along_path(
         loop,
@@ -267,25 +277,32 @@ def _counts(segments: int, *, along_path: bool) -> dict[str, int]:
 
 
 def _schedules(
-    steps: int, dt: float, *, fixed_levels: bool = False
+    steps: int, dt: float, *box: tuple[float, ...], fixed_levels: bool = False
 ) -> dict[str, Conditions]:
     """Uniform and wet roads; friction drops at a random time of the segment."""
     dry: dict[str, Any] = {} if fixed_levels else {"friction": (0.3, 0.9)}
     wet: dict[str, Any] = {} if fixed_levels else WET
+    drop = (0.0, steps * dt)
     return {
-        "uniform": partial(uniform_road, steps=steps, **dry),
-        "wet": partial(
-            wet_road, steps=steps, dt=dt, drop_time=(0.0, steps * dt), **wet
+        "uniform": lambda key: in_box(uniform_road(key, steps=steps, **dry), *box),
+        "wet": lambda key: in_box(
+            wet_road(key, steps=steps, dt=dt, drop_time=drop, **wet), *box
         ),
     }
 
 
-def from_s3(steps: int, dt: float) -> Conditions:
-    """Return the schedule of S3, from a random time of it."""
+def from_s3(
+    steps: int,
+    dt: float,
+    env_low: tuple[float, ...] = BOX[0],
+    env_high: tuple[float, ...] = BOX[1],
+) -> Conditions:
+    """Return the schedule of S3 in the box E, from a random time of it."""
 
-    def conditions(key: Key) -> Float[Array, "time 2"]:
+    def conditions(key: Key) -> Float[Array, "time environment"]:
         road_key, moment_key = jax.random.split(key)
         schedule = switching_road(road_key, steps=4 * steps, dt=dt)
+        schedule = in_box(schedule, env_low, env_high)
         return jax.lax.dynamic_slice_in_dim(
             schedule, jax.random.randint(moment_key, (), 0, 3 * steps), steps
         )

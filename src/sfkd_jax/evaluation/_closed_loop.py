@@ -144,14 +144,14 @@ def _ahead(scenario: Scenario, progress: Scalar, *, dt: float, horizon: int) -> 
 
 
 def observed_environment(
-    envs: Float[Array, "time 2"],
+    envs: Float[Array, "time environment"],
     key: Key,
     *,
     dt: float,
     delay_s: float = 0.0,
     noise: tuple[float, float] = (0.0, 0.0),
     bias: tuple[Real, Real] = (0.0, 0.0),
-) -> Float[Array, "time 2"]:
+) -> Float[Array, "time environment"]:
     """Return ê_k = e_{k−d} + b + n_k: delayed, biased, with white noise.
 
     Until the first delayed value arrives, the first value of the episode is observed.
@@ -179,11 +179,11 @@ def observed_environment(
 
 def disturbed_environment(
     plant: Vehicle,
-    envs: Float[Array, "time 2"],
+    envs: Float[Array, "time environment"],
     key: Key,
     *,
     largest: float | Float[Array, ""],
-) -> Float[Array, "time 2"]:
+) -> Float[Array, "time environment"]:
     """Return the environment with random side forces, expressed as additional wind.
 
     Args:

@@ -103,9 +103,11 @@ def _simulate(settings: Settings) -> Dataset:
     store.print_message(f"generating {options.segments} segments")
     trajectories = jax.jit(_generator(settings))(drive_key)
     along_path = bool(settings.along_path)
+    labels = segment_scenarios(options.segments, along_path=along_path)
+    if getattr(settings.vehicle, "env", None):
+        trajectories, labels = _without_faults(trajectories, labels)
     if along_path:
         check_on_path(trajectories)
-    labels = segment_scenarios(options.segments, along_path=along_path)
     return split(
         trajectories,
         split_key,
@@ -116,18 +118,32 @@ def _simulate(settings: Settings) -> Dataset:
     )
 
 
+def _without_faults(runs: Trajectory, *more: Any) -> tuple[Any, ...]:
+    """Drop the runs in which a simulator failed, and say how many they are."""
+    finite = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
+    if finite.all():
+        return runs, *more
+    failed = f"the simulator failed in {np.sum(~finite)} of {len(finite)} runs"
+    if not finite.any():
+        raise ValueError(f"{failed}; the warnings above say how")
+    store.print_message(f"{failed}, which are dropped")
+    return tuple(
+        jax.tree.map(lambda leaf: leaf[finite], part) for part in (runs, *more)
+    )
+
+
 def _generator(
     settings: Settings, *, switching: bool = False, **changes: int
 ) -> Callable[[Key], Trajectory]:
     """Return key -> the runs of a data set, or as many under the switching of S3."""
     changes["held_out"] = switching
+    box: Any = settings.environment.box
     if settings.along_path:
         options = arguments(settings.dataset, generate_along_path) | changes
-        box: Any = settings.environment.box
         return partial(generate_along_path, closed_loop(settings), **options, **box)
     plant = build.build_vehicle(settings.vehicle)
     options = arguments(settings.dataset, generate) | changes
-    return partial(generate, plant, build.build_driver(plant), **options)
+    return partial(generate, plant, build.build_driver(plant), **options, **box)
 
 
 def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:

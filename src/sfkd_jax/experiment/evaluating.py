@@ -49,7 +49,12 @@ def make_episodes(settings: Settings) -> EpisodeSet:
     """Draw the episodes of a scenario."""
     plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
     check_step(plant)
-    family = build.build_scenario(settings.scenario, plant, duration=protocol.episode_s)
+    family = build.build_scenario(
+        settings.scenario,
+        plant,
+        duration=protocol.episode_s,
+        **settings.environment.box,
+    )
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
     @jax.jit

@@ -22,6 +22,7 @@ from sfkd_jax.build import (
 )
 from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
+from sfkd_jax.plants import described
 from sfkd_jax.policy import CERTIFICATE
 from sfkd_jax.ranges import (
     Bounds,
@@ -90,7 +91,7 @@ class DatasetSettings:
         return AlongPathSettings if "law" in values else SimulatedSettings
 
 
-@takes(data.generate, skip=("held_out",))
+@takes(data.generate, skip=("held_out", *_BOX))
 class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
@@ -285,8 +286,11 @@ def parse_settings(values: Values) -> Settings:
             f"environment that varies: {why}; pass environment.source=measured or none"
         )
     model = replace(settings.model, environment=reads and environment.is_known)
-    root = str(Path(settings.root).expanduser())
-    return replace(settings, model=model, root=root)
+    root, vehicle = str(Path(settings.root).expanduser()), settings.vehicle
+    # Recorded with the run: whoever loads its policy need not have the simulator.
+    if name := getattr(vehicle, "env", None):
+        vehicle = replace(vehicle, **described(name))
+    return replace(settings, model=model, root=root, vehicle=vehicle)
 
 
 def register() -> None:

@@ -84,12 +84,13 @@ def check_settings(settings: Settings) -> None:
 
 def _sizes(settings: Settings, plant: Vehicle) -> dict[str, int]:
     """Sizes of body state, control and environment that the model reads."""
-    env = len(settings.logs.columns.environment) if settings.logs else 0
+    logs, low = settings.logs, settings.environment.low or ()
+    env = len(logs.columns.environment if logs else low) or 2
     state = len(plant.state_names) - 3
     # e_y and e_ψ in place of the pose; w = (ν, κ, v_ref) has four entries.
     if settings.along_path:
-        return {"state": state + 2, "control": 4, "env": 2}
-    return {"state": state, "control": 2, "env": env or 2}
+        return {"state": state + 2, "control": 4, "env": env}
+    return {"state": state, "control": 2, "env": env}
 
 
 def _zero_law(sizes: Mapping[str, int]) -> PathLaw:

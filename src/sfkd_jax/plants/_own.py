@@ -1,10 +1,14 @@
-"""A vehicle of the user's own, given by a step function or by logs alone."""
+"""A vehicle of the user's own: a step function, any simulator, or logs alone."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from sfkd_jax.plants._simulator import Make, pool_of
 from sfkd_jax.plants._vehicle import Vehicle, nominal_derivative, rk4
 from sfkd_jax.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
@@ -77,6 +81,62 @@ def _no_step(state: State, control: Control, env: Environment) -> State:
         "vehicle=own is known from logs alone, so it cannot be simulated: "
         "pass vehicle.step=module:function"
     )
+
+
+def simulator(make: Make) -> Vehicle:
+    """Return a simulator that is not written in JAX, and runs on the host, as a plant.
+
+    `make()` returns an object with
+
+        state_names, dt           names of all states, pose first, and the period [s]
+        reset(state)              to any state, which then decides all that follows
+        step(control, environment) -> state one period later
+
+    or an environment of gymnasium with `state_names` and `dt`, which is reset with
+    `options={"state": …, "environment": …}` before every step, and whose observation
+    begins with the state. Where it has them, `control_low`, `control_high`,
+    `wheelbase`, `speed_loop` and `wind_force` are the settings of `own`, `workers` is
+    the number of its copies, each in a process of its own (by default one a core), and
+    `timeout_s` the longest time for a step.
+
+    The step works under `jit`, `vmap` and `scan`, a batch at a time, without a
+    gradient. If the simulator fails, the state is NaN, and a warning says why.
+
+    Args:
+        make: package.module:function, or a function that can be pickled.
+    """
+    return own(**described(make), step=on_host(make))
+
+
+def described(make: Make) -> dict[str, Any]:
+    """Return the settings of `own` that a simulator knows itself.
+
+    Raises:
+        ValueError: it cannot be made.
+    """
+    about = pool_of(make).about
+    return {name: value for name, value in about.items() if name != "timeout_s"}
+
+
+def on_host(make: Make) -> Step:
+    """Return the step of a simulator; its workers start at the first call."""
+
+    def call(*inputs: Any) -> np.ndarray:
+        batch = inputs[0].shape[:-1]
+        # In double precision, as simulators compute.
+        columns = [
+            np.asarray(each, float).reshape(-1, each.shape[-1]) for each in inputs
+        ]
+        after = pool_of(make).step(np.concatenate(columns, axis=1))
+        return after.reshape(*batch, -1).astype(inputs[0].dtype)
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
+        inputs = state, control, env
+        # One call for a whole batch, which the workers divide among themselves.
+        return jax.pure_callback(call, shape, *inputs, vmap_method="broadcast_all")
+
+    return step
 
 
 def check_step(plant: Vehicle) -> None:

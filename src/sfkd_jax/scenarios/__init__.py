@@ -7,8 +7,10 @@ from sfkd_jax.paths import path_through as path_through
 from sfkd_jax.paths import point_at as point_at
 from sfkd_jax.paths import project as project
 from sfkd_jax.paths import reference_window as reference_window
+from sfkd_jax.scenarios._conditions import BOX as BOX
 from sfkd_jax.scenarios._conditions import gusts as gusts
 from sfkd_jax.scenarios._conditions import held_road as held_road
+from sfkd_jax.scenarios._conditions import in_box as in_box
 from sfkd_jax.scenarios._conditions import random_side_forces as random_side_forces
 from sfkd_jax.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.scenarios._conditions import switching_road as switching_road

@@ -18,6 +18,8 @@ SWITCH_PERIOD = 3.0
 """Between two switches of S3 [s]."""
 PEAK_WIND = 8.0
 """Largest gust of S2 [m/s]."""
+BOX = ((0.3, -PEAK_WIND), (0.9, PEAK_WIND))
+"""The environments of the benchmark, which levels and ranges are about."""
 HOLD, RAMP = (1.0, 3.0), 0.5
 """Of gusts: range of the time from one ramp to the next, and its duration [s]."""
 
@@ -75,6 +77,30 @@ def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
     # The same hair, so that a period has the same number of steps each time.
     visit = jnp.floor(jnp.arange(steps) * dt / SWITCH_PERIOD + 1e-6).astype(int)
     return levels[visit]
+
+
+def in_box(envs: Schedule, low: Corner, high: Corner) -> Float[Array, "time env"]:
+    """Move a schedule of the benchmark to another box, at the same shares of its ends.
+
+    The first entry takes the place of the friction, from its lower to its upper end;
+    all others that of the wind: to both sides if 0 lies inside their range, else from
+    the lower end on. In the benchmark's own box nothing changes, not a bit.
+
+    Args:
+        envs: (friction, wind) over time.
+        low: lower corner of E, in units of e.
+        high: upper corner of E.
+    """
+    if (tuple(low), tuple(high)) == BOX:
+        return envs
+    grip = (envs[:, :1] - BOX[0][0]) / (BOX[1][0] - BOX[0][0])
+    wind = jnp.repeat(envs[:, 1:] / PEAK_WIND, len(low) - 1, axis=1)
+    bottom, top = jnp.asarray(low), jnp.asarray(high)
+    sided = (bottom < 0.0) & (top > 0.0)
+    from_zero = jnp.where(wind < 0.0, -wind * bottom[1:], wind * top[1:])
+    from_end = bottom[1:] + jnp.abs(wind) * (top - bottom)[1:]
+    first = bottom[:1] + grip * (top - bottom)[:1]
+    return jnp.concatenate([first, jnp.where(sided[1:], from_zero, from_end)], axis=1)
 
 
 def random_side_forces(

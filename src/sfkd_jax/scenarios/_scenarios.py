@@ -8,11 +8,14 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from sfkd_jax.paths import Path
 from sfkd_jax.ranges import Positive, Span
 from sfkd_jax.scenarios._conditions import (
+    BOX,
     Schedule,
+    in_box,
     switching_road,
     uniform_road,
     wet_road,
@@ -27,16 +30,16 @@ class Scenario(NamedTuple):
 
     Attributes:
         initial_state: x_0.
-        envs: e_0 … e_{T-1} that the plant is in, (time, 2).
-        observed_envs: the same as the controller observes it, (time, 2).
+        envs: e_0 … e_{T-1} that the plant is in, (time, environment).
+        observed_envs: the same as the controller observes it, (time, environment).
         path: to follow.
         speed: to hold [m/s].
         course: obstacles on the path, or None: the path is to be followed.
     """
 
     initial_state: State
-    envs: Schedule
-    observed_envs: Schedule
+    envs: Float[Array, "time environment"]
+    observed_envs: Float[Array, "time environment"]
     path: Path
     speed: Scalar
     course: Course | None = None
@@ -83,8 +86,10 @@ def scenario(
     wavelengths: Span = (50.0, 160.0),
     state_size: int,
     dt: float,
+    env_low: tuple[float, ...] = BOX[0],
+    env_high: tuple[float, ...] = BOX[1],
 ) -> Family:
-    """Return a family of the benchmark by name, see `ROADS`.
+    """Return a family of the benchmark by name, see `ROADS`, in any box of e.
 
     Args:
         name: of the family.
@@ -95,6 +100,8 @@ def scenario(
         state_size: of the vehicle; the episode starts on the path at `speed`, other
             body states zero.
         dt: sampling period [s].
+        env_low: lower corner of E, see `in_box`.
+        env_high: upper corner of E.
     """
     if name not in ROADS:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
@@ -108,15 +115,15 @@ def scenario(
             key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
         )
 
-    def conditions(key: Key) -> Schedule:
-        return road.conditions(key, steps, dt)
+    def conditions(key: Key) -> Float[Array, "time environment"]:
+        return in_box(road.conditions(key, steps, dt), env_low, env_high)
 
     course = road.course and partial(road.course, speed=speed)
     return family(conditions, path, course, speed=speed, state_size=state_size)
 
 
 def family(
-    conditions: Callable[[Key], Schedule],
+    conditions: Callable[[Key], Float[Array, "time environment"]],
     paths: Callable[[Key], Path],
     courses: Callable[[Key, Path], Course] | None = None,
     *,

@@ -1,0 +1,101 @@
+"""Simulators that are not written in JAX: one with every fault, and highway-env's car.
+
+In a file of their own, which workers import.
+"""
+
+import os
+import time
+
+import gymnasium
+import numpy as np
+
+FAULTS = {
+    1: "ZeroDivisionError: division by zero",
+    2: "ValueError: [1.0] are not 5 finite numbers",
+    3: "are not 5 finite numbers",
+    4: "its process ended",
+    5: "no answer in 1 s",
+}
+"""By the first entry of e."""
+
+
+class Faulty:
+    """A point that turns; as a test wishes, it fails."""
+
+    state_names = ("p_x", "p_y", "yaw", "v", "steps")
+    control_low, control_high, timeout_s, workers = [-1, -2], [1, 2], 1, 2
+    dt = np.float32(0.5)
+
+    def reset(self, state):
+        self.state = state
+
+    def step(self, control, environment):
+        print("is on stderr")
+        match round(environment[0]):
+            case 1:
+                1 / 0  # noqa: B018
+            case 2:
+                return [1.0]
+            case 3:
+                return self.state * np.nan
+            case 4:
+                os._exit(1)
+            case 5:
+                time.sleep(60.0)
+        x, y, yaw, v, steps = self.state
+        x, y = x + v * np.cos(yaw) * self.dt, y + v * np.sin(yaw) * self.dt
+        self.state = np.array([x, y, yaw + control[0], v + control[1], steps + 1.0])
+        return self.state
+
+
+class Gym(gymnasium.Env):
+    """The same as an environment of gymnasium."""
+
+    state_names, dt = Faulty.state_names, 0.5
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        self.inner, self.given = Faulty(), options["environment"]
+        self.inner.reset(options["state"])
+        return self.inner.state, {}
+
+    def step(self, action):
+        state = self.inner.step(action, self.given)
+        return np.append(state, 99.0), 0.0, state[3] < 0.0, False, {}
+
+
+def wrapped():
+    return gymnasium.wrappers.TimeLimit(Gym(), max_episode_steps=1)
+
+
+def highway():
+    """The dynamic bicycle of highway-env; e = (grip [-], side force [kN])."""
+    from highway_env.vehicle.dynamics import BicycleVehicle
+
+    class Bicycle(BicycleVehicle):
+        push = 0.0
+
+        def derivative_func(self, *given, **more):
+            rates = super().derivative_func(*given, **more)
+            rates[4] += self.push
+            return rates
+
+    class Highway:
+        state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
+        dt, wheelbase = 0.1, Bicycle.LENGTH
+        control_low, control_high = (-0.5, -6.0), (0.5, 3.0)
+
+        def reset(self, state):
+            self.car = Bicycle(None, state[:2], state[2], state[3])
+            self.car.lateral_speed, self.car.yaw_rate = state[4:]
+
+        def step(self, control, environment):
+            car = self.car
+            car.FRICTION_FRONT = car.FRICTION_REAR = 15.0 * environment[0]
+            car.push = environment[1] / 1.5  # on 1.5 t
+            car.act({"steering": control[0], "acceleration": control[1]})
+            for _ in range(2):
+                car.step(0.05)
+            return car.state[:, 0]
+
+    return Highway()

@@ -1,0 +1,117 @@
+"""Simulators that are not written in JAX: what they step is what they are asked for,
+and what they do wrong ends one run alone.
+"""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit, last_line, run_command
+
+from sfkd_jax import build, plants
+from tests.plants import simulators
+
+HERE = "tests.plants.simulators"
+LIMITS = {"control_low": [-1.0, -2.0], "control_high": [1.0, 2.0]}
+
+
+@pytest.fixture(scope="module")
+def car():
+    return plants.simulator(f"{HERE}:Faulty")
+
+
+def rows(faults):
+    """One vehicle for each entry, with the fault that it asks for."""
+    count = len(faults)
+    states = np.random.default_rng(0).normal(size=(count, 5)).astype(np.float32)
+    env = jnp.stack([jnp.asarray(faults, jnp.float32), jnp.zeros(count)], axis=1)
+    return jnp.asarray(states), jnp.full((count, 2), 0.25), env
+
+
+def own_step(state, control, env):
+    simulator = simulators.Faulty()
+    simulator.reset(np.asarray(state, float))
+    return simulator.step(np.asarray(control, float), env).astype(np.float32)
+
+
+def test_a_simulator_is_a_plant_under_jit_vmap_and_scan(car):
+    assert (car.dt, car.control_low, car.control_high) == (0.5, (-1, -2), (1, 2))
+    assert car.state_names == simulators.Faulty.state_names
+    given = rows([0] * 7)
+    expected = np.stack([own_step(*one) for one in zip(*given, strict=True)])
+    np.testing.assert_array_equal(jit(jax.vmap(car.step))(*given), expected)
+    pairs = jax.tree.map(lambda leaf: leaf[:6].reshape(2, 3, -1), given)
+    nested = jit(jax.vmap(jax.vmap(car.step)))(*pairs)
+    np.testing.assert_array_equal(nested.reshape(6, -1), expected[:6])
+    one = [leaf[0] for leaf in given]
+    along = jax.lax.scan(lambda x, _: (car.step(x, *one[1:]),) * 2, one[0], length=3)
+    assert along[1][:, 4].tolist() == (one[0][4] + np.arange(1, 4)).tolist()
+
+
+def test_what_a_simulator_does_wrong_ends_that_run_alone_and_is_said_once(car):
+    given = rows([0, *simulators.FAULTS, 0, 1, 0])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        after = np.asarray(jit(jax.vmap(car.step))(*given))
+    failed = np.asarray(given[2][:, 0]) > 0
+    assert np.isnan(after[failed]).all()
+    expected = [own_step(*one) for one in zip(*given, strict=True) if one[2][0] == 0]
+    np.testing.assert_array_equal(after[~failed], np.stack(expected))
+    said = [str(one.message) for one in said if "simulator" in str(one.message)]
+    assert len(said) == len(simulators.FAULTS)
+    for reason in simulators.FAULTS.values():
+        assert any(reason in line for line in said), reason
+    assert all(line.startswith(f"simulator {HERE}:Faulty: ") for line in said)
+    # A run that has ended is not stepped any more: no fault, and no time.
+    ended = jnp.where(jnp.asarray(failed)[:, None], jnp.nan, given[0])
+    assert np.isnan(
+        np.asarray(jit(jax.vmap(car.step))(ended, *given[1:]))[failed]
+    ).all()
+
+
+def test_an_environment_of_gymnasium_starts_at_every_state():
+    plant = plants.simulator(f"{HERE}:wrapped")
+    state, control, env = (leaf[0] for leaf in rows([0]))
+    state = state.at[3].set(5.0)
+    for _ in range(2):  # more steps than an episode of the environment has
+        expected = own_step(state, control, env)
+        state = plant.step(state, control, env)
+        np.testing.assert_array_equal(state, expected)
+    with pytest.warns(UserWarning, match="the episode was terminated"):
+        assert np.isnan(plant.step(state.at[3].set(-1.0), control, env)).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        ("nowhere.at_all:make", "ModuleNotFoundError: No module named 'nowhere'"),
+        (f"{HERE}:missing", "AttributeError: module .* has no attribute 'missing'"),
+        ("builtins:dict", "AttributeError: 'dict' object has no attribute"),
+        ("os:abort", "its process ended"),
+    ],
+)
+def test_a_simulator_that_cannot_be_made_is_refused_in_one_line(make, reason):
+    with pytest.raises(ValueError, match=f"vehicle.env={make}: {reason}") as refusal:
+        plants.simulator(make)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_policy_of_a_simulator_is_described_without_it():
+    plant = build.build_vehicle(LIMITS | {"name": "own", "env": "not.installed:here"})
+    assert plant.simulated
+    plants.check_step(plant)
+
+
+def test_the_bicycle_of_highway_env_is_driven_by_every_command(tmp_path):
+    """Runs in the simulator, a policy learned from them, and that policy in it again."""
+    pytest.importorskip("highway_env")
+    car = plants.simulator(f"{HERE}:highway")
+    low, high = (0.35, -3.0), (1.0, 3.0)
+    assert car.wheelbase == 5.0
+    words = ["+experiment=smoke", "vehicle=simulator", f"vehicle.env={HERE}:highway"]
+    words += [f"environment.low={list(low)}", f"environment.high={list(high)}"]
+    words += ["dataset.segments=40", "dataset.steps=20", "training.window=10"]
+    done = last_line(run_command("train", *map(str, words), cwd=tmp_path))
+    assert done
