@@ -56,6 +56,7 @@ COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "geometry": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
+    "plants": {"numpy"},
     "data": {"numpy", "pyarrow", "pint"},
     "models": {"flax"},
     "control": {"numpy"},

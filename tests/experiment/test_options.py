@@ -18,6 +18,7 @@ OPTIONS = [
     if file.parent.name != "hydra"
 ]
 LIMITS = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
+GIVEN = {"own": LIMITS, "simulator": ("vehicle.env=tests.plants.simulators:Faulty",)}
 
 
 def of(group):
@@ -46,8 +47,8 @@ def test_every_model_builds_and_names_its_system(option):
     + [("dynamic", controller) for controller in of("controller")],
 )
 def test_every_controller_builds_on_every_vehicle(vehicle, controller):
-    limits = LIMITS if vehicle == "own" else ()
-    chosen = settings(f"vehicle={vehicle}", f"controller={controller}", *limits)
+    given = GIVEN.get(vehicle, ())
+    chosen = settings(f"vehicle={vehicle}", f"controller={controller}", *given)
     plant = build.build_vehicle(chosen.vehicle)
     along = chosen.controller.sampling == "law"
     law = any_law(len(plant.state_names) - 1) if along else None

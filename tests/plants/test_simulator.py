@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit, last_line, run_command
+from composing import settings
+from helpers import jit
 
 from sfkd_jax import build, plants
+from sfkd_jax.experiment import data, evaluating
 from tests.plants import simulators
 
 HERE = "tests.plants.simulators"
@@ -104,14 +106,38 @@ def test_a_policy_of_a_simulator_is_described_without_it():
     plants.check_step(plant)
 
 
-def test_the_bicycle_of_highway_env_is_driven_by_every_command(tmp_path):
-    """Runs in the simulator, a policy learned from them, and that policy in it again."""
+def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path):
+    """Recorded, and evaluated in S3 at the levels of its own box of e."""
     pytest.importorskip("highway_env")
-    car = plants.simulator(f"{HERE}:highway")
     low, high = (0.35, -3.0), (1.0, 3.0)
-    assert car.wheelbase == 5.0
-    words = ["+experiment=smoke", "vehicle=simulator", f"vehicle.env={HERE}:highway"]
-    words += [f"environment.low={list(low)}", f"environment.high={list(high)}"]
-    words += ["dataset.segments=40", "dataset.steps=20", "training.window=10"]
-    done = last_line(run_command("train", *map(str, words), cwd=tmp_path))
-    assert done
+    chosen = settings(
+        "+experiment=s3_body",
+        "vehicle=simulator",
+        f"vehicle.env={HERE}:highway",
+        f"environment.low={list(low)}",
+        f"environment.high={list(high)}",
+        "dataset.segments=20",
+        "dataset.steps=10",
+        "dataset.shares=[0.25,0.25,0.25,0.25]",
+        "evaluation.systems=[nominal]",
+        "evaluation.episodes=2",
+        "evaluation.episode_s=3",
+        "controller.mppi.num_samples=16",
+        f"root={tmp_path}",
+    )
+    assert (chosen.vehicle.dt, chosen.vehicle.wheelbase) == (0.1, 5.0)
+    runs = data.ensure_dataset(chosen)[0].train
+    car = simulators.highway()
+    for state, control, env, after in zip(
+        runs.states[0], runs.controls[0], runs.envs[0], runs.states[0, 1:], strict=False
+    ):
+        car.reset(np.asarray(state, float))
+        expected = car.step(np.asarray(control, float), np.asarray(env, float))
+        np.testing.assert_allclose(after, expected, rtol=2e-6, atol=2e-6)
+    episodes = evaluating.make_episodes(chosen)
+    envs = np.asarray(episodes.scenarios.envs)
+    levels = np.unique(np.abs(envs).reshape(-1, 2), axis=0)
+    np.testing.assert_allclose(levels, [[1.0, 0.0]], atol=1e-6)
+    (result,) = evaluating.drive(chosen, evaluating.load_systems(chosen), episodes)
+    assert result.row["departures"] == 0
+    assert result.row["rmse_m"]["mean"] < 0.5

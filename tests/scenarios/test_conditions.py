@@ -81,6 +81,22 @@ def test_s3_holds_the_side_of_the_wind_for_a_visit_and_draws_it_anew_for_the_nex
     assert abs(repeated - 0.5) < 4 * 0.5 / np.sqrt(windy[:, 1:].size)
 
 
+@pytest.mark.parametrize("name", ["s1", "s2", "s3"])
+def test_levels_are_shares_of_the_box_and_of_the_benchmarks_own_to_the_bit(name):
+    """One entry, two, and three of which the last has no other side."""
+    sample = lambda **box: np.asarray(jit(make(name, **box))(KEYS[3]).envs)
+    known = sample()
+    own = sample(env_low=(0.3, -8.0), env_high=(0.9, 8.0))
+    np.testing.assert_array_equal(known, own)
+    one = sample(env_low=(10.0,), env_high=(70.0,))
+    np.testing.assert_allclose(one[:, 0], 100.0 * known[:, 0] - 20.0, rtol=1e-5)
+    wide = sample(env_low=(0.0, -1.0, 100.0), env_high=(6.0, 4.0, 900.0))
+    share = known[:, 1] / 8.0
+    expected = [10.0 * known[:, 0] - 3.0, np.where(share < 0, share, 4 * share)]
+    expected += [100.0 + 800.0 * np.abs(share)]
+    np.testing.assert_allclose(wide, np.stack(expected, axis=1), rtol=1e-5, atol=1e-5)
+
+
 def kolmogorov_distance(values, low, high):
     """sup |empirical distribution − uniform distribution|."""
     ranks = np.arange(len(values) + 1) / len(values)

@@ -120,16 +120,15 @@ def _simulate(settings: Settings) -> Dataset:
 
 def _without_faults(runs: Trajectory, *more: Any) -> tuple[Any, ...]:
     """Drop the runs in which a simulator failed, and say how many they are."""
-    finite = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
-    if finite.all():
+    states = np.asarray(runs.states)
+    kept = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
+    if (lost := len(states) - len(kept)) == 0:
         return runs, *more
-    failed = f"the simulator failed in {np.sum(~finite)} of {len(finite)} runs"
-    if not finite.any():
+    failed = f"the simulator failed in {lost} of {len(states)} runs"
+    if not len(kept):
         raise ValueError(f"{failed}; the warnings above say how")
     store.print_message(f"{failed}, which are dropped")
-    return tuple(
-        jax.tree.map(lambda leaf: leaf[finite], part) for part in (runs, *more)
-    )
+    return jax.tree.map(lambda leaf: leaf[kept], (runs, *more))
 
 
 def _generator(

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
@@ -58,7 +59,7 @@ def make_episodes(settings: Settings) -> EpisodeSet:
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
     @jax.jit
-    def draw(keys: Key, sensor_keys: Key) -> Scenario:
+    def draw(keys: Array, sensor_keys: Array) -> Scenario:
         scenarios = jax.vmap(family)(keys)
         observe = partial(evaluation.observed_environment, dt=plant.dt, **sensor)
         observed = jax.vmap(observe)(scenarios.envs, sensor_keys)
@@ -86,7 +87,7 @@ def _over_episodes(
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
 
-    def run_all(scenarios: Scenario, keys: Key) -> evaluation.Episode:
+    def run_all(scenarios: Scenario, keys: Array) -> evaluation.Episode:
         count = len(keys)
         batch = [
             jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys))

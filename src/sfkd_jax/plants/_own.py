@@ -79,7 +79,7 @@ def _no_step(state: State, control: Control, env: Environment) -> State:
     """The step of a vehicle that is known from logs alone."""
     raise ValueError(
         "vehicle=own is known from logs alone, so it cannot be simulated: "
-        "pass vehicle.step=module:function"
+        "pass vehicle.step=module:function or vehicle.env=module:simulator"
     )
 
 
@@ -109,13 +109,8 @@ def simulator(make: Make) -> Vehicle:
 
 
 def described(make: Make) -> dict[str, Any]:
-    """Return the settings of `own` that a simulator knows itself.
-
-    Raises:
-        ValueError: it cannot be made.
-    """
-    about = pool_of(make).about
-    return {name: value for name, value in about.items() if name != "timeout_s"}
+    """Return the settings of `own` that a simulator knows, or refuse it."""
+    return pool_of(make).about
 
 
 def on_host(make: Make) -> Step:

@@ -18,7 +18,7 @@ from functools import cache
 from importlib import import_module
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from queue import Empty, LifoQueue
+from queue import LifoQueue
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -26,16 +26,10 @@ import numpy as np
 Make: TypeAlias = str | Callable[[], Any]
 """package.module:function or the function, which a worker calls for its copy."""
 
-KNOWN = ("control_low", "control_high", "wheelbase", "speed_loop", "wind_force")
-"""What a simulator may know of its vehicle, besides dt and the names of states."""
-KINDS = {"workers": int, "speed_loop": bool}
-"""Of what is no number or pair of numbers."""
-START = 120.0
-"""Longest time until a worker has made its copy [s]."""
-STEP = 20.0
-"""Longest time for one step, unless the simulator has `timeout_s` [s]."""
-MOST_LOST = 5
-"""Processes that a worker may lose; after that it simulates nothing any more."""
+KNOWN = ("dt", "control_low", "control_high", "wheelbase", "wind_force", "speed_loop")
+"""What a simulator may say about its vehicle, besides `state_names`."""
+START, STEP = 120.0, 20.0
+"""Longest times to make a simulator and, unless it has `timeout_s`, for a step [s]."""
 
 
 @cache
@@ -57,14 +51,14 @@ class Pool:
     def __init__(self, make: Make) -> None:
         """Start one worker; a ValueError says why the simulator cannot be made."""
         first = _Worker(make)
-        self.about = dict(first.about)
+        self.about = first.start()
         cores = os.cpu_count() or 1
         if hasattr(os, "sched_getaffinity"):
             cores = len(os.sched_getaffinity(0))
-        count = self.about.pop("workers", cores)
         # The other processes start when there is work for them.
+        more = self.about.pop("workers", cores) - 1
         self._idle: LifoQueue[_Worker] = LifoQueue()
-        for worker in [*(_Worker(make, first) for _ in range(count - 1)), first]:
+        for worker in [*(_Worker(make) for _ in range(more)), first]:
             self._idle.put(worker)
 
     def step(self, rows: np.ndarray) -> np.ndarray:
@@ -72,21 +66,16 @@ class Pool:
         states = np.full((len(rows), len(self.about["state_names"])), math.nan)
         # A run that has ended stays NaN and costs nothing.
         alive = np.flatnonzero(np.isfinite(rows).all(axis=1))
-        if not len(alive):
-            return states
+        taken: list[_Worker] = []
         # Waits for one; the others may be at work for another thread.
-        taken = [self._idle.get()]
-        while len(taken) < len(alive):
-            try:
-                taken.append(self._idle.get_nowait())
-            except Empty:
-                break
-        parts = np.array_split(alive, len(taken))
+        while len(taken) < len(alive) and not (taken and self._idle.empty()):
+            taken.append(self._idle.get())
+        parts = np.array_split(alive, max(len(taken), 1))
         try:
-            for worker, part in zip(taken, parts, strict=True):
+            for worker, part in zip(taken, parts, strict=False):
                 worker.send(rows[part])
-            for worker, part in zip(taken, parts, strict=True):
-                states[part] = worker.receive()
+            for worker, part in zip(taken, parts, strict=False):
+                states[part] = worker.receive(states[part])
         finally:
             for worker in taken:
                 self._idle.put(worker)
@@ -96,15 +85,14 @@ class Pool:
 class _Worker:
     """One process; it is started when it is needed, and again when it is lost."""
 
-    def __init__(self, make: Make, like: _Worker | None = None) -> None:
-        """Start it, or know of another one what the simulator is."""
-        self._make, self._lost, self._process = make, 0, None
-        self._told: set[str] = set() if like is None else like._told
+    def __init__(self, make: Make) -> None:
+        self._make, self._process, self._patience = make, None, STEP
         self._rows = np.zeros((0, 0))
-        self.about: dict[str, Any] = like.about if like else self._start()
 
-    def _start(self) -> dict[str, Any]:
+    def start(self) -> dict[str, Any]:
         """Start the process, and return what the simulator says about itself."""
+        if self._process is not None:
+            self._process.kill()
         self._channel, theirs = Pipe()
         number = theirs.fileno()
         # A program, not a fork, in which jax would hang, and not a spawned copy of the
@@ -117,48 +105,39 @@ class _Worker:
         )
         weakref.finalize(self, self._process.kill)
         theirs.close()
-        paths = [path or os.getcwd() for path in sys.path]
         try:
-            self._channel.send((paths, self._make))
+            self._channel.send(([path or os.getcwd() for path in sys.path], self._make))
             about = self._answer(START)
         except (EOFError, OSError) as reason:
             about = str(reason) or "its process ended"
         if isinstance(about, str):
             raise ValueError(f"vehicle.env={self._make}: {about}")
+        self._patience = about.pop("timeout_s")
         return about
 
-    def _answer(self, seconds: float) -> Any:
-        if not self._channel.poll(seconds):
-            raise TimeoutError(f"no answer in {seconds:g} s")
-        return self._channel.recv()
-
-    def send(self, rows: np.ndarray) -> None:
-        """Begin to step rows."""
-        self._rows = rows
+    def send(self, rows: np.ndarray, *, singly: bool = False) -> None:
+        """Begin to step rows; `singly`: with an answer after each of them."""
         if self._process is None:
-            self._start()
-        self._ask(rows, singly=False)
-
-    def _ask(self, rows: np.ndarray, *, singly: bool) -> None:
+            self.start()
+        self._rows = rows
         # A process that is gone is noticed when its answer is missing.
         with suppress(OSError):
             self._channel.send((rows, singly))
 
-    def receive(self) -> np.ndarray:
-        """Return the states of the rows that were sent."""
-        rows, singly, done = self._rows, len(self._rows) == 1, 0
-        states = np.full((len(rows), len(self.about["state_names"])), math.nan)
-        while done < len(rows) and self._lost < MOST_LOST:
+    def receive(self, states: np.ndarray) -> np.ndarray:
+        """Return the states of the rows that were sent, in the array that is given."""
+        rows, done, singly = self._rows, 0, len(states) == 1
+        while done < len(rows):
             try:
-                after, faults = self._answer(self.about["timeout_s"])
+                after, faults = self._answer(self._patience)
             except (EOFError, OSError) as reason:
                 if singly:
                     self._warn(str(reason) or "its process ended", rows[done])
                     done += 1
                 # One by one from here on, so that only the row at fault is lost.
                 singly = True
-                self._restart()
-                self._ask(rows[done:], singly=True)
+                self.start()
+                self.send(rows[done:], singly=True)
                 continue
             for index, fault in faults:
                 self._warn(fault, rows[done + index])
@@ -166,21 +145,20 @@ class _Worker:
             done += len(after)
         return states
 
-    def _restart(self) -> None:
-        assert self._process is not None
-        self._process.kill()
-        self._lost += 1
-        if self._lost == MOST_LOST:
-            self._warn(f"lost {MOST_LOST} processes, nothing more is simulated")
-        else:
-            self._start()
+    def _answer(self, seconds: float) -> Any:
+        if not self._channel.poll(seconds):
+            raise TimeoutError(f"no answer in {seconds:g} s")
+        return self._channel.recv()
 
-    def _warn(self, fault: str, *rows: np.ndarray) -> None:
-        if fault not in self._told:
-            self._told.add(fault)
-            where = [f" at {np.round(row, 4).tolist()}" for row in rows]
-            text = f"simulator {self._make}: {fault}{''.join(where)}"
+    def _warn(self, fault: str, row: np.ndarray) -> None:
+        if (self._make, fault) not in _SAID:
+            _SAID.add((self._make, fault))
+            text = f"simulator {self._make}: {fault} at {np.round(row, 4).tolist()}"
             warnings.warn(text, stacklevel=2)
+
+
+_SAID: set[tuple[Make, str]] = set()
+"""Faults that were warned about; they have no place in the text of a second one."""
 
 
 class _Environment:
@@ -210,14 +188,13 @@ class _Environment:
 
 def _about(simulator: Any) -> dict[str, Any]:
     """What a simulator says about itself, as plain numbers and words."""
-    known = {name: getattr(simulator, name, None) for name in (*KNOWN, "workers")}
-    known |= {"timeout_s": getattr(simulator, "timeout_s", STEP), "dt": simulator.dt}
-    about: dict[str, Any] = {"state_names": tuple(map(str, simulator.state_names))}
-    for name, value in known.items():
-        if value is not None:
-            plain = np.asarray(value, KINDS.get(name, float)).tolist()
+    about: dict[str, Any] = {"timeout_s": STEP, "dt": simulator.dt}
+    for name in (*KNOWN, "workers", "timeout_s"):
+        if (value := getattr(simulator, name, None)) is not None:
+            kind = {"workers": int, "speed_loop": bool}.get(name, float)
+            plain = np.asarray(value, kind).tolist()
             about[name] = tuple(plain) if isinstance(plain, list) else plain
-    return about
+    return about | {"state_names": tuple(map(str, simulator.state_names))}
 
 
 def _serve(channel: Connection) -> None:
@@ -239,7 +216,7 @@ def _serve(channel: Connection) -> None:
     while True:
         rows, singly = channel.recv()
         states, faults, began = [], [], time.monotonic()
-        for index, row in enumerate(rows):
+        for left, row in zip(range(len(rows) - 1, -1, -1), rows, strict=True):
             try:
                 simulator.reset(row[:size])
                 after = simulator.step(row[size : size + 2], row[size + 2 :])
@@ -251,8 +228,7 @@ def _serve(channel: Connection) -> None:
                 faults.append((len(states), _line(reason)))
             states.append(after)
             # Early too: who waits must tell slow steps from one that hangs.
-            due = singly or time.monotonic() - began > often
-            if due or index + 1 == len(rows):
+            if not left or singly or time.monotonic() - began > often:
                 channel.send((np.asarray(states), faults))
                 states, faults, began = [], [], time.monotonic()
 
