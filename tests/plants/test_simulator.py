@@ -11,12 +11,11 @@ import pytest
 from composing import settings
 from helpers import jit
 
-from sfkd_jax import build, plants
+from sfkd_jax import plants
 from sfkd_jax.experiment import data, evaluating
 from tests.plants import simulators
 
 HERE = "tests.plants.simulators"
-LIMITS = {"control_low": [-1.0, -2.0], "control_high": [1.0, 2.0]}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +61,7 @@ def test_what_a_simulator_does_wrong_ends_that_run_alone_and_is_said_once(car):
     expected = [own_step(*one) for one in zip(*given, strict=True) if one[2][0] == 0]
     np.testing.assert_array_equal(after[~failed], np.stack(expected))
     said = [str(one.message) for one in said if "simulator" in str(one.message)]
-    assert len(said) == len(simulators.FAULTS)
+    assert len(said) == len({*simulators.FAULTS.values()})
     for reason in simulators.FAULTS.values():
         assert any(reason in line for line in said), reason
     assert all(line.startswith(f"simulator {HERE}:Faulty: ") for line in said)
@@ -100,31 +99,15 @@ def test_a_simulator_that_cannot_be_made_is_refused_in_one_line(make, reason):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_policy_of_a_simulator_is_described_without_it():
-    plant = build.build_vehicle(LIMITS | {"name": "own", "env": "not.installed:here"})
-    assert plant.simulated
-    plants.check_step(plant)
-
-
 def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path):
     """Recorded, and evaluated in S3 at the levels of its own box of e."""
     pytest.importorskip("highway_env")
-    low, high = (0.35, -3.0), (1.0, 3.0)
-    chosen = settings(
-        "+experiment=s3_body",
-        "vehicle=simulator",
-        f"vehicle.env={HERE}:highway",
-        f"environment.low={list(low)}",
-        f"environment.high={list(high)}",
-        "dataset.segments=20",
-        "dataset.steps=10",
-        "dataset.shares=[0.25,0.25,0.25,0.25]",
-        "evaluation.systems=[nominal]",
-        "evaluation.episodes=2",
-        "evaluation.episode_s=3",
-        "controller.mppi.num_samples=16",
-        f"root={tmp_path}",
-    )
+    words = f"""+experiment=s3_body vehicle=simulator vehicle.env={HERE}:highway
+        environment.low=[0.35,-3] environment.high=[1,3] dataset.segments=20
+        dataset.steps=10 dataset.shares=[0.25,0.25,0.25,0.25] root={tmp_path}
+        evaluation.systems=[nominal] evaluation.episodes=2 evaluation.episode_s=3
+        controller.mppi.num_samples=16"""
+    chosen = settings(*words.split())
     assert (chosen.vehicle.dt, chosen.vehicle.wheelbase) == (0.1, 5.0)
     runs = data.ensure_dataset(chosen)[0].train
     car = simulators.highway()

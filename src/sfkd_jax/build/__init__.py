@@ -112,19 +112,18 @@ def build_scenario(
     plant: plants.Vehicle,
     *,
     duration: float,
-    env_low: tuple[float, ...] | None = None,
-    env_high: tuple[float, ...] | None = None,
+    **box: tuple[float, ...] | None,
 ) -> scenarios.Family:
     """Return the scenario family of the settings, with episodes of a duration [s].
 
-    Its environments are in the box E, by default in that of the benchmark.
+    `box` are the corners env_low and env_high of E, by default those of the benchmark.
     """
     settings = parse(ScenarioSettings, settings, "scenario.")
+    corners: Any = {name: corner for name, corner in box.items() if corner}
     return scenarios.scenario(
         **arguments(settings, scenarios.scenario),
+        **corners,
         duration=duration,
-        env_low=env_low or scenarios.BOX[0],
-        env_high=env_high or scenarios.BOX[1],
         state_size=len(plant.state_names),
         dt=plant.dt,
     )

@@ -50,12 +50,8 @@ def make_episodes(settings: Settings) -> EpisodeSet:
     """Draw the episodes of a scenario."""
     plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
     check_step(plant)
-    family = build.build_scenario(
-        settings.scenario,
-        plant,
-        duration=protocol.episode_s,
-        **settings.environment.box,
-    )
+    about: Any = {"duration": protocol.episode_s} | settings.environment.box
+    family = build.build_scenario(settings.scenario, plant, **about)
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
     @jax.jit

@@ -97,7 +97,7 @@ def simulator(make: Make) -> Vehicle:
     begins with the state. Where it has them, `control_low`, `control_high`,
     `wheelbase`, `speed_loop` and `wind_force` are the settings of `own`, `workers` is
     the number of its copies, each in a process of its own (by default one a core), and
-    `timeout_s` the longest time for a step.
+    `timeout_s` the longest time for its share of a batch.
 
     The step works under `jit`, `vmap` and `scan`, a batch at a time, without a
     gradient. If the simulator fails, the state is NaN, and a warning says why.

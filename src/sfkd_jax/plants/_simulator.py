@@ -5,11 +5,9 @@ This file is also the program of a worker. It imports no jax, so that one starts
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
-import time
 import warnings
 import weakref
 from collections.abc import Callable
@@ -18,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from queue import LifoQueue
+from threading import Lock
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -28,8 +26,10 @@ Make: TypeAlias = str | Callable[[], Any]
 
 KNOWN = ("dt", "control_low", "control_high", "wheelbase", "wind_force", "speed_loop")
 """What a simulator may say about its vehicle, besides `state_names`."""
-START, STEP = 120.0, 20.0
-"""Longest times to make a simulator and, unless it has `timeout_s`, for a step [s]."""
+PATIENCE = 120.0
+"""Longest time to make a simulator and, unless it has `timeout_s`, to answer [s]."""
+SAID: set[tuple[Make, str]] = set()
+"""Faults that were warned about."""
 
 
 @cache
@@ -52,33 +52,26 @@ class Pool:
         """Start one worker; a ValueError says why the simulator cannot be made."""
         first = _Worker(make)
         self.about = first.start()
-        cores = os.cpu_count() or 1
-        if hasattr(os, "sched_getaffinity"):
-            cores = len(os.sched_getaffinity(0))
         # The other processes start when there is work for them.
-        more = self.about.pop("workers", cores) - 1
-        self._idle: LifoQueue[_Worker] = LifoQueue()
-        for worker in [*(_Worker(make) for _ in range(more)), first]:
-            self._idle.put(worker)
+        more = self.about.pop("workers") - 1
+        self._workers, self._lock = (
+            [first, *(_Worker(make) for _ in range(more))],
+            Lock(),
+        )
 
     def step(self, rows: np.ndarray) -> np.ndarray:
         """Return the state one step after each row (state, control, environment)."""
-        states = np.full((len(rows), len(self.about["state_names"])), math.nan)
+        states = np.full((len(rows), len(self.about["state_names"])), np.nan)
         # A run that has ended stays NaN and costs nothing.
         alive = np.flatnonzero(np.isfinite(rows).all(axis=1))
-        taken: list[_Worker] = []
-        # Waits for one; the others may be at work for another thread.
-        while len(taken) < len(alive) and not (taken and self._idle.empty()):
-            taken.append(self._idle.get())
+        taken = self._workers[: len(alive)]
         parts = np.array_split(alive, max(len(taken), 1))
-        try:
+        # Episodes of several threads take turns: a step is short beside their plans.
+        with self._lock:
             for worker, part in zip(taken, parts, strict=False):
                 worker.send(rows[part])
             for worker, part in zip(taken, parts, strict=False):
-                states[part] = worker.receive(states[part])
-        finally:
-            for worker in taken:
-                self._idle.put(worker)
+                states[part] = worker.states(rows[part])
         return states
 
 
@@ -86,8 +79,8 @@ class _Worker:
     """One process; it is started when it is needed, and again when it is lost."""
 
     def __init__(self, make: Make) -> None:
-        self._make, self._process, self._patience = make, None, STEP
-        self._rows = np.zeros((0, 0))
+        self._make, self._patience = make, PATIENCE
+        self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> dict[str, Any]:
         """Start the process, and return what the simulator says about itself."""
@@ -105,71 +98,57 @@ class _Worker:
         )
         weakref.finalize(self, self._process.kill)
         theirs.close()
-        try:
-            self._channel.send(([path or os.getcwd() for path in sys.path], self._make))
-            about = self._answer(START)
-        except (EOFError, OSError) as reason:
-            about = str(reason) or "its process ended"
-        if isinstance(about, str):
-            raise ValueError(f"vehicle.env={self._make}: {about}")
-        self._patience = about.pop("timeout_s")
+        self.send(([path or os.getcwd() for path in sys.path], self._make))
+        about, faults = self._answer(PATIENCE)
+        if faults:
+            raise ValueError(f"vehicle.env={self._make}: {faults[0]}")
+        self._patience, self._size = about.pop("timeout_s"), len(about["state_names"])
         return about
 
-    def send(self, rows: np.ndarray, *, singly: bool = False) -> None:
-        """Begin to step rows; `singly`: with an answer after each of them."""
+    def send(self, what: Any) -> None:
+        """Ask for something; that the process is gone is noticed by its answer."""
         if self._process is None:
             self.start()
-        self._rows = rows
-        # A process that is gone is noticed when its answer is missing.
         with suppress(OSError):
-            self._channel.send((rows, singly))
+            self._channel.send(what)
 
-    def receive(self, states: np.ndarray) -> np.ndarray:
-        """Return the states of the rows that were sent, in the array that is given."""
-        rows, done, singly = self._rows, 0, len(states) == 1
-        while done < len(rows):
-            try:
-                after, faults = self._answer(self._patience)
-            except (EOFError, OSError) as reason:
-                if singly:
-                    self._warn(str(reason) or "its process ended", rows[done])
-                    done += 1
-                # One by one from here on, so that only the row at fault is lost.
-                singly = True
-                self.start()
-                self.send(rows[done:], singly=True)
-                continue
-            for index, fault in faults:
-                self._warn(fault, rows[done + index])
-            states[done : done + len(after)] = after
-            done += len(after)
+    def states(self, rows: np.ndarray) -> Any:
+        """Return the states one step after the rows that were sent."""
+        states, faults = self._answer(self._patience)
+        if states is None:
+            self.start()
+            # One by one, so that only the row at fault is lost.
+            if len(rows) > 1:
+                return np.concatenate([self._alone(row[None]) for row in rows])
+            states = np.full((1, self._size), np.nan)
+        for fault in faults:
+            # Its kind, not its numbers, which differ at every step.
+            kind = self._make, fault.partition(":")[0]
+            if kind not in SAID:
+                SAID.add(kind)
+                warnings.warn(f"simulator {self._make}: {fault}", stacklevel=2)
         return states
 
-    def _answer(self, seconds: float) -> Any:
-        if not self._channel.poll(seconds):
-            raise TimeoutError(f"no answer in {seconds:g} s")
-        return self._channel.recv()
+    def _alone(self, row: np.ndarray) -> Any:
+        self.send(row)
+        return self.states(row)
 
-    def _warn(self, fault: str, row: np.ndarray) -> None:
-        if (self._make, fault) not in _SAID:
-            _SAID.add((self._make, fault))
-            text = f"simulator {self._make}: {fault} at {np.round(row, 4).tolist()}"
-            warnings.warn(text, stacklevel=2)
-
-
-_SAID: set[tuple[Make, str]] = set()
-"""Faults that were warned about; they have no place in the text of a second one."""
+    def _answer(self, seconds: float) -> tuple[Any, list[str]]:
+        """The answer and faults; None if the process hangs or has ended."""
+        try:
+            if self._channel.poll(seconds):
+                return self._channel.recv()
+            return None, [f"no answer in {seconds:g} s"]
+        except (EOFError, OSError):
+            return None, ["its process ended"]
 
 
 class _Environment:
     """A gymnasium environment as a simulator; its observation is the state."""
 
     def __init__(self, env: Any) -> None:
-        self._env, self._state = env, None
-        self.control_low, self.control_high = (
-            env.action_space.low,
-            env.action_space.high,
-        )
+        self._env, limits = env, env.action_space
+        self.control_low, self.control_high = limits.low, limits.high
 
     def __getattr__(self, name: str) -> Any:
         """What describes the vehicle is below the wrappers of gymnasium."""
@@ -188,8 +167,10 @@ class _Environment:
 
 def _about(simulator: Any) -> dict[str, Any]:
     """What a simulator says about itself, as plain numbers and words."""
-    about: dict[str, Any] = {"timeout_s": STEP, "dt": simulator.dt}
-    for name in (*KNOWN, "workers", "timeout_s"):
+    about: dict[str, Any] = {"timeout_s": PATIENCE, "workers": os.cpu_count() or 1}
+    if hasattr(os, "sched_getaffinity"):
+        about["workers"] = len(os.sched_getaffinity(0))
+    for name in (*KNOWN, *about):
         if (value := getattr(simulator, name, None)) is not None:
             kind = {"workers": int, "speed_loop": bool}.get(name, float)
             plain = np.asarray(value, kind).tolist()
@@ -209,28 +190,24 @@ def _serve(channel: Connection) -> None:
             simulator = _Environment(simulator)
         about = _about(simulator)
     except Exception as reason:  # code of the user raises anything
-        channel.send(_line(reason))
+        channel.send((None, [_line(reason)]))
         return
-    channel.send(about)
-    size, often = len(about["state_names"]), 0.25 * about["timeout_s"]
+    channel.send((about, []))
+    size = len(about["state_names"])
     while True:
-        rows, singly = channel.recv()
-        states, faults, began = [], [], time.monotonic()
-        for left, row in zip(range(len(rows) - 1, -1, -1), rows, strict=True):
+        rows, faults = channel.recv(), []
+        states = np.full((len(rows), size), np.nan)
+        for index, row in enumerate(rows):
             try:
                 simulator.reset(row[:size])
                 after = simulator.step(row[size : size + 2], row[size + 2 :])
                 after = np.asarray(after, dtype=float).ravel()[:size]
                 if len(after) < size or not np.isfinite(after).all():
                     raise ValueError(f"{after.tolist()} are not {size} finite numbers")
+                states[index] = after
             except Exception as reason:
-                after = np.full(size, math.nan)
-                faults.append((len(states), _line(reason)))
-            states.append(after)
-            # Early too: who waits must tell slow steps from one that hangs.
-            if not left or singly or time.monotonic() - began > often:
-                channel.send((np.asarray(states), faults))
-                states, faults, began = [], [], time.monotonic()
+                faults.append(f"{_line(reason)} at {np.round(row, 4).tolist()}")
+        channel.send((states, faults))
 
 
 def _line(reason: Exception) -> str:
@@ -239,7 +216,5 @@ def _line(reason: Exception) -> str:
 
 
 if __name__ == "__main__":
-    try:
+    with suppress(EOFError, KeyboardInterrupt):
         _serve(Connection(int(sys.argv[1])))
-    except (EOFError, KeyboardInterrupt):
-        sys.exit()
