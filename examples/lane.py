@@ -2,36 +2,36 @@
 
 import json
 import sys
+from pathlib import Path
 
 import jax
-import matplotlib.pyplot as plt
-from matplotlib.animation import FuncAnimation
+import jax.numpy as jnp
 
 import sfkd_jax
-from sfkd_jax import evaluation, scenarios
+from sfkd_jax import build, evaluation, scenarios
+from sfkd_jax.report import film
 
-asked = {"--runs": 1, "--seed": 0, "--vehicle": "dynamic"}
+asked = {"--runs": 1, "--seed": 0, "--vehicle": "dynamic", "--film": "lane.gif"}
 asked |= dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
 policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{asked['--vehicle']}_path")
 plant, bound = policy.vehicle, policy.certificate["corridor"]
 loop = {"dt": plant.dt, "observation_noise": bound["conditions"]["sensor_noise"]}
-loop |= {"horizon": 20, "record": {"inside": lambda info: info["shield_healthy"]}}
-road = {"peak_curvature": 0.004, "wavelengths": (100.0, 300.0), "duration": 60.0}
-size = {"state_size": len(plant.state_names), "dt": plant.dt}
-course = scenarios.scenario(name="obstacles", **road, **size)
+told = {"inside": "shield_healthy", "reference": "reference", "corridor": "corridor"}
+loop["record"] = {k: lambda info, name=name: info[name] for k, name in told.items()}
+road = {"name": "obstacles", "peak_curvature": 0.004, "wavelengths": (100.0, 300.0)}
+course = jax.jit(build.build_scenario(road, plant, duration=60.0))
 car = plant.step, policy.in_lane(), policy.params
-run = jax.jit(lambda key: evaluation.simulate(*car, course(key), key, **loop))
+run = jax.jit(lambda *given: evaluation.simulate(*car, *given, horizon=20, **loop))
 keys = jax.random.split(jax.random.key(int(asked["--seed"])), int(asked["--runs"]))
-drives, first = jax.lax.map(run, keys), course(keys[0]).course
-_, axes = plt.subplots(figsize=(9, 3), subplot_kw={"aspect": "equal"})
-axes.plot(*first.lane.path.points[:, :2].T, ":", *drives.states[0, :, :2].T, "-")
-_ = [axes.add_patch(plt.Circle(at, 0.8)) for at in first.obstacles.position[:, 0]]
-axes.plot(9 / 59, 0.5, "ks", transform=axes.transAxes)
-FuncAnimation(
-    axes.figure,
-    lambda at: axes.set(xlim=(at[0] - 9, at[0] + 50), ylim=(at[1] - 9, at[1] + 9)),
-    drives.states[0, ::4],
-).save("lane.gif", fps=8)
+drives = jax.tree.map(lambda *x: jnp.stack(x), *(run(course(k), k) for k in keys))
+# The film: two obstacles, and a lane that is blocked.
+place = jnp.array([[34.0, 64.0, 102.0, 102.0, 102.0], [1.2, -2.2, -3.5, 0.0, 3.5]])
+scene, (along, aside) = course(keys[0]), jnp.pad(place, ((0, 0), (0, 11)), "edge")
+there = {"position": scenarios.beside(scene.path, along, aside)[:, None]}
+posts = scene.course.obstacles._replace(**there, present=jnp.arange(16) < 5)
+scene = scene._replace(course=scene.course._replace(obstacles=posts, along=along))
+shown = film.LaneFilm(scene, run(scene, keys[0]), dt=plant.dt, car=scenarios.CAR)
+film.write(Path(asked["--film"]), shown)
 seen, speed = drives.signals, drives.progress[:, -1].mean() / 60.0
 found = {"runs": len(keys), "collisions": (seen["gap"].min(axis=1) < 0.0).sum()}
 found |= {"clearance_below_claim": (seen["gap"] < seen["clearance"]).sum()}

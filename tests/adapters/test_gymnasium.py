@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from sfkd_jax import adapters
+from sfkd_jax.lanes import Lane, Obstacles
 
 adapters.register_gymnasium()
 SETTINGS = {"scenario": "s3", "duration": 3.0}
@@ -69,6 +70,33 @@ def test_an_image_shows_the_car_and_changes_as_it_drives():
     np.testing.assert_array_equal(again, first)
     # gymnasium's own checker last: it closes what it has checked.
     check_env(env.unwrapped)
+
+
+def test_in_a_lane_obstacles_appear_and_what_touches_them_has_ended():
+    settings = {"duration": 9.0, "render_mode": "rgb_array"}
+    env = gymnasium.make("sfkd_jax/Lane-v0", **settings)
+    seen, _ = env.reset(seed=0)
+    inside = env.unwrapped
+    assert not seen["obstacles"].any()
+    for _ in range(90):
+        x, y = seen["obstacles"][0, :2]
+        # Straight on, then towards the first one.
+        action = inside.action([np.arctan2(y, x), 0.0]) if x else None
+        seen, _, terminated, truncated, _ = inside.step(action)
+        if terminated or truncated:
+            break
+    state, _, (lane, obstacles) = inside.situation()
+    assert (type(lane), type(obstacles)) == (Lane, Obstacles)
+    apart = np.linalg.norm(obstacles.position[:, 0] - state[:2], axis=1)
+    place = seen["obstacles"][seen["obstacles"][:, 6] > 0]
+    assert (terminated, truncated) == (True, False)
+    assert np.linalg.norm(place[0, :2]) == pytest.approx(apart[0], abs=1e-3)
+    assert apart[0] - 0.8 < 2.5
+    np.testing.assert_array_equal(seen["lane"][:, 4:], 5.25)
+    assert np.any(env.render() != [env.reset(seed=0), env.render()][1])
+    check_env(inside)
+    with pytest.raises(ValueError, match="needs a scenario with obstacles"):
+        adapters.GymnasiumLane(scenario="s3")
 
 
 def test_it_refuses_bad_settings_and_a_forked_process(monkeypatch):

@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sfkd_jax.adapters._task import DrivingTask as DrivingTask
+from sfkd_jax.adapters._task import LaneTask as LaneTask
 from sfkd_jax.adapters._task import Moment as Moment
 from sfkd_jax.adapters._task import Transition as Transition
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
         commonroad_controller as commonroad_controller,
     )
     from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
+    from sfkd_jax.adapters._gymnasium import GymnasiumLane as GymnasiumLane
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
 
@@ -31,7 +33,7 @@ _LAZY = {
         "register_brax",
     ),
     ("_commonroad", "plants"): ("commonroad_controller", "commonroad_vehicle"),
-    ("_gymnasium", "gym"): ("GymnasiumVehicle", "register_gymnasium"),
+    ("_gymnasium", "gym"): ("GymnasiumLane", "GymnasiumVehicle", "register_gymnasium"),
 }
 """File and the extra that installs what it imports -> its public names."""
 

@@ -10,10 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from sfkd_jax.adapters._task import DrivingTask, Moment
+from sfkd_jax.adapters._task import DrivingTask, LaneTask, Moment
 from sfkd_jax.scenarios import Scenario
 
-NAME = "sfkd_jax/Vehicle-v0"
 PROCESS = os.getpid()
 """That imported this file, and started jax; a forked one inherits the number."""
 VIEW = 30.0
@@ -23,10 +22,12 @@ CAR = np.asarray([[2.25, 0.9], [2.25, -0.9], [-2.25, -0.9], [-2.25, 0.9]])
 
 
 def register_gymnasium() -> None:
-    """Make `gymnasium.make("sfkd_jax/Vehicle-v0", …)` build a `GymnasiumVehicle`."""
-    # A second registration would warn.
-    if NAME not in gymnasium.registry:
-        gymnasium.register(id=NAME, entry_point="sfkd_jax.adapters:GymnasiumVehicle")
+    """Tell `gymnasium.make` of "sfkd_jax/Vehicle-v0" and "sfkd_jax/Lane-v0"."""
+    for kind in ("Vehicle", "Lane"):
+        # A second registration would warn.
+        if (name := f"sfkd_jax/{kind}-v0") not in gymnasium.registry:
+            entry = f"sfkd_jax.adapters:Gymnasium{kind}"
+            gymnasium.register(id=name, entry_point=entry)
 
 
 class GymnasiumVehicle(gymnasium.Env):
@@ -39,15 +40,17 @@ class GymnasiumVehicle(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    task: type[DrivingTask] = DrivingTask
 
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array, got {render_mode!r}")
-        task = self._task = DrivingTask(**settings)
+        task = self._task = self.task(**settings)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / task.plant.dt)}
-        low, high = (np.asarray(end, np.float32) for end in task.observation_bounds)
-        self.observation_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        spaces = jax.tree.map(gymnasium.spaces.Box, *task.observation_bounds)
+        named = isinstance(spaces, dict)
+        self.observation_space = gymnasium.spaces.Dict(spaces) if named else spaces
         self.action_space = gymnasium.spaces.Box(
             -1.0, 1.0, (task.action_size,), np.float32
         )
@@ -56,9 +59,18 @@ class GymnasiumVehicle(gymnasium.Env):
         self._start, self._advance = jax.jit(task.reset), jax.jit(task.step)
         self._observe = jax.jit(task.observe)
 
+    def situation(self) -> tuple[Any, Any, Any]:
+        """Return what `Controller.act` takes: state, e, and what is ahead."""
+        return self._task.situation(*self._reached())
+
+    def action(self, control: Any) -> np.ndarray:
+        """Return a control of the vehicle as an action in [-1, 1]."""
+        control = jax.numpy.asarray(control, np.float32)
+        return np.asarray(self._task.action(control))
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode on a new road; there are no options."""
         # Not in __init__: gymnasium passes on what a worker raises from here on.
         if os.getpid() != PROCESS:
@@ -74,10 +86,12 @@ class GymnasiumVehicle(gymnasium.Env):
         return self._seen(road, moment), {}
 
     def step(
-        self, action: np.ndarray
-    ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Simulate one sampling period."""
+        self, action: np.ndarray | None
+    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Simulate one sampling period; with None neither steering nor drive."""
         road, moment = self._reached()
+        if action is None:
+            action = self.action(np.zeros(self._task.action_size))
         action = np.asarray(action, dtype=np.float32)
         moment, outcome = self._advance(road, moment, action)
         self._now = road, moment
@@ -89,12 +103,12 @@ class GymnasiumVehicle(gymnasium.Env):
             {name: float(value) for name, value in outcome.measures.items()},
         )
 
-    def _seen(self, road: Scenario, moment: Moment) -> np.ndarray:
+    def _seen(self, road: Scenario, moment: Moment) -> Any:
         """Extend the driven line, and return the observation."""
         self._driven.append(np.asarray(moment.state)[:2])
-        space: Any = self.observation_space
+        seen = jax.tree.map(np.array, self._observe(road, moment))
         # Rounding may take an angle beyond its bound.
-        return np.clip(np.array(self._observe(road, moment)), space.low, space.high)
+        return jax.tree.map(np.clip, seen, *self._task.observation_bounds)
 
     def render(self) -> np.ndarray | None:  # pyright: ignore
         """Return the image of the last step, uint8, if the mode is "rgb_array"."""
@@ -109,20 +123,36 @@ class GymnasiumVehicle(gymnasium.Env):
         return self._now
 
 
+class GymnasiumLane(GymnasiumVehicle):
+    """Driving round obstacles as `gymnasium.Env`, with the settings of `LaneTask`.
+
+    `policy.in_lane()` drives it: its `act` takes `situation()`, `action` its control.
+    """
+
+    task = LaneTask
+
+
 def _image(
     task: DrivingTask, road: Scenario, moment: Moment, driven: list[Any]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Path, lane and driven line around the car."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
     # Not of pyplot, which would keep every figure that is made.
     figure = Figure(figsize=(6.4, 4.8), dpi=100)
     axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     points, state = np.asarray(road.path.points), np.asarray(moment.state)
-    normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
-    for side, dashes in ((-task.lane, "--"), (0.0, "-"), (task.lane, "--")):
-        axes.plot(*(points[:, :2] + side * normal).T, dashes, color="0.6", linewidth=1)
+    normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
+    left, right = task.lane, task.lane
+    if road.course is not None:
+        lane, obstacles = jax.tree.map(np.asarray, road.course[:2])
+        left, right = lane.left, lane.right
+        for place, _, half, radius, present in zip(*obstacles, strict=True):
+            axes.add_patch(Circle(place[0], present * (radius + np.hypot(*half))))
+    for side, dashes in ((-right, "--"), (0.0, "-"), (left, "--")):
+        axes.plot(*(points[:, :2].T + side * normal), dashes, color="0.6", linewidth=1)
     axes.plot(*np.stack(driven).T, color="C0", linewidth=1.5)
     c, s = np.cos(state[2]), np.sin(state[2])
     axes.fill(*(state[:2] + CAR @ np.asarray([[c, s], [-s, c]])).T, "C0", alpha=0.6)

@@ -1,28 +1,38 @@
-"""Path following as a task, shared by the brax and gymnasium adapters."""
+"""Path following and driving in a lane as tasks, for brax and gymnasium."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax import build
 from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
-from sfkd_jax.scenarios import Family, Scenario, point_at, project, reference_window
+from sfkd_jax.scenarios import (
+    CAR,
+    Course,
+    Family,
+    Scenario,
+    car_clearance,
+    in_view,
+    point_at,
+    project,
+    reference_window,
+)
 from sfkd_jax.types import (
     BODY,
     POSE,
     Control,
     Environment,
     Key,
-    Reference,
     Scalar,
     State,
 )
@@ -135,7 +145,9 @@ class DrivingTask:
         """A key -> a road with its schedule of friction and wind."""
         if not isinstance(self.scenario, str):
             return self.scenario
-        named = {"name": self.scenario}
+        named: Any = {"name": self.scenario}
+        if self.scenario == "obstacles":
+            named |= {"peak_curvature": 0.004, "wavelengths": (100.0, 300.0)}
         return build.build_scenario(named, self.plant, duration=self.duration)
 
     @property
@@ -144,7 +156,7 @@ class DrivingTask:
         return len(self.plant.control_low)
 
     @property
-    def observation_bounds(self) -> tuple[list[float], list[float]]:
+    def observation_bounds(self) -> tuple[Any, Any]:
         """Smallest and largest observation."""
         inf, body = math.inf, len(self.plant.state_names) - 3
         # Angles are wrapped and actions clipped; nothing else has a limit.
@@ -153,12 +165,12 @@ class DrivingTask:
         low = [-value for value in high]
         # Only friction is not symmetric about 0.
         low[-len(points) - 2] = 0.0
-        return low, high
+        return np.asarray(low, np.float32), np.asarray(high, np.float32)
 
     @property
     def observation_size(self) -> int:
         """Entries of an observation."""
-        return len(self.observation_bounds[0])
+        return self.observation_bounds[0].size
 
     def control(self, action: Control) -> Control:
         """Return an action in [-1, 1] in physical units, clipped to the limits."""
@@ -200,7 +212,7 @@ class DrivingTask:
         )
         # Facing backwards is leaving too: the other errors would not show it.
         backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
-        left = ~sound | (jnp.abs(kept.lateral) > self.lane) | backwards
+        left = ~sound | self._outside(road, kept) | backwards
         # Time or road, whichever ends first.
         over = kept.progress >= road.path.length
         ended = (kept.count >= road.envs.shape[0]) | over
@@ -217,9 +229,11 @@ class DrivingTask:
         # Leaving at the last step is a failure, no end in time.
         return kept, Transition(reward, left, ~left & ended, measures)
 
-    def situation(
-        self, road: Scenario, moment: Moment
-    ) -> tuple[State, Environment, Reference]:
+    def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
+        """Whether the car has left the lane."""
+        return jnp.abs(moment.lateral) > self.lane
+
+    def situation(self, road: Scenario, moment: Moment) -> tuple[State, Any, Any]:
         """Return state, environment and reference, what `Controller.act` takes."""
         reference = reference_window(
             road.path,
@@ -230,15 +244,93 @@ class DrivingTask:
         )
         return moment.state, _at(road.observed_envs, moment), reference
 
-    def observe(self, road: Scenario, moment: Moment) -> Float[Array, " observation"]:
+    def observe(self, road: Scenario, moment: Moment) -> Any:
         """Return the observation, in the order that the class lists."""
-        state, env, reference = self.situation(road, moment)
+        state, env, reference = DrivingTask.situation(self, road, moment)
         # In the frame of the car: a policy need not know where it is in the world.
         ahead = jax.vmap(between, in_axes=(None, 0))(state[POSE], reference[:, :3])
         points = jnp.concatenate([ahead, reference[:, 3:]], axis=1).ravel()
         errors = jnp.stack([moment.lateral, _heading(road, moment)])
         action = self.action(moment.control)
         return jnp.concatenate([errors, state[BODY], action, env, points])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LaneTask(DrivingTask):
+    """`DrivingTask` round obstacles that are seen late, in the middle of a lane.
+
+    The observation is a dict of arrays; x, y, ψ are in the frame of the car:
+
+        observation  e_y off the middle, e_ψ, s, a as of `DrivingTask`       n + 1
+        environment  observed friction [-] and side wind [m/s]                   2
+        lane         next points: x, y, ψ, v, to left and right edge   preview × 6
+        obstacles    in view: x, y, ψ, half of length and width, radius,
+                     1; rows of 0 are none                             in view × 7
+
+    The car has left the lane when it touches an edge or an obstacle.
+
+    Attributes:
+        scenario: "obstacles", or a family with courses.
+        preview: number of points ahead.
+        lateral: q_y [1/m²]: whoever passes an obstacle is off the middle.
+    """
+
+    scenario: str | Family = "obstacles"
+    preview: AtLeastOne = 60
+    lateral: NonNegative = 0.02
+
+    @property
+    def observation_bounds(self) -> tuple[Any, Any]:
+        """Smallest and largest observation; there are none."""
+        seen = jax.eval_shape(
+            self.observe, *jax.eval_shape(self.reset, jax.random.key(0))
+        )
+        high = {name: np.full(x.shape, np.inf, np.float32) for name, x in seen.items()}
+        return {name: -rows for name, rows in high.items()}, high
+
+    def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
+        side = moment.lateral * jnp.asarray([1.0, -1.0]) + CAR[1]
+        room = jnp.min(_edges(_course(road), moment.progress) - side)
+        return (room < 0.0) | (
+            car_clearance(_course(road).obstacles, moment.state) < 0.0
+        )
+
+    def situation(self, road: Scenario, moment: Moment) -> tuple[State, Any, Any]:
+        """Return state, environment and scene, what a controller in a lane takes."""
+        state, env, _ = super().situation(road, moment)
+        course = _course(road)
+        return state, env, (course.lane, in_view(course, moment.progress))
+
+    def observe(self, road: Scenario, moment: Moment) -> Any:
+        """Return the observation, as the class describes it."""
+        state, env, (_, near) = self.situation(road, moment)
+        flat, points = super().observe(road, moment), 4 * self.preview
+        there = jnp.concatenate([near.position[:, 0], near.yaw[:, None]], axis=1)
+        there = jax.vmap(between, in_axes=(None, 0))(state[POSE], there)
+        rest = near.radius[:, None], near.present[:, None]
+        rows = jnp.concatenate([there, near.half, *rest], axis=1)
+        passed = road.speed * self.plant.dt * jnp.arange(1, self.preview + 1)
+        edges = _edges(_course(road), moment.progress + passed)
+        return {
+            "observation": flat[: -points - len(env)],
+            "environment": env,
+            "lane": jnp.concatenate([flat[-points:].reshape(-1, 4), edges], axis=1),
+            "obstacles": jnp.where(near.present[:, None], rows, 0.0),
+        }
+
+
+def _course(road: Scenario) -> Course:
+    """The obstacles of a road."""
+    if road.course is None:
+        raise ValueError("a lane needs a scenario with obstacles, this one has none")
+    return road.course
+
+
+def _edges(course: Course, s: Float[Array, "*shape"]) -> Array:
+    """Distances from the middle to the left and right edges at s [m], (…, 2)."""
+    left, right = course.lane.left, course.lane.right
+    at = course.lane.path.spacing * jnp.arange(left.shape[0])
+    return jnp.stack([jnp.interp(s, at, edge) for edge in (left, right)], axis=-1)
 
 
 def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:

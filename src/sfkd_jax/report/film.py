@@ -1,4 +1,4 @@
-"""The film of a group of episodes: cars on copies of a road, their deviation below."""
+"""Films: cars on copies of a road with their deviation below, and a car in a lane."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from matplotlib.patches import FancyArrowPatch, Polygon, Rectangle
 from matplotlib.text import Text
 from PIL import Image
 
+from sfkd_jax.evaluation import Episode
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
@@ -31,6 +32,21 @@ _MOST, _TRAIL, _COLOURS = 10, 20, 48
 """Largest widening of deviations, steps of a trail, colours of the file."""
 _CAR = np.array([[2.4, 1.8, -2.2, -2.2, 1.8], [0.0, 0.85, 0.85, -0.85, -0.85]])
 """Corners of a car in its frame [m]."""
+_SIGHT, _SIDE = (-8.0, 34.0), 6.6
+"""Of a lane that is seen: behind and ahead of the car, to either side [m]."""
+_OBSTACLE: dict[str, Any] = dict(fc=style.SOFT, ec=style.DARK, lw=0.8)
+_INFLATED: dict[str, Any] = dict(fc=style.SECOND, alpha=0.3, lw=0)
+_CORRIDOR: dict[str, Any] = dict(fc=style.ACCENT, alpha=0.45, lw=0)
+_REFERENCE: dict[str, Any] = dict(color=style.ACCENT, lw=0.9)
+_BODY: Any = (
+    (
+        [[1, 0.8], [1, -0.8], [0.9, -1], [-1, -1], [-1, 1], [0.9, 1]],
+        dict(fc="#5b9bd5", ec=style.DARK, lw=1.0),
+    ),
+    ([[0.45, 0.7], [0.45, -0.7], [0.15, -0.6], [0.15, 0.6]], dict(fc=style.DARK)),
+    ([[-0.75, 0.6], [-0.75, -0.6], [-0.6, -0.55], [-0.6, 0.55]], dict(fc=style.DARK)),
+)
+"""Of the car: outline, front and rear window, in shares of half its size."""
 
 
 def film_of(
@@ -55,7 +71,7 @@ def film_of(
     return write(path, Film(chosen, min(round(SECONDS / dt), length), corridor))
 
 
-def write(path: Path, film: Film) -> Path:
+def write(path: Path, film: Film | LaneFilm) -> Path:
     """Write the GIF of a film, in real time."""
     # Defaults: a user's style file would move axes that are placed by hand.
     with matplotlib.rc_context():
@@ -67,7 +83,7 @@ def write(path: Path, film: Film) -> Path:
     first, *rest = [
         one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames
     ]
-    pause = round(1e3 * EVERY * film.cars[0].dt)
+    pause = round(1e3 * EVERY * film.dt)
     first.save(path, save_all=True, append_images=rest, duration=pause, loop=0)
     return path
 
@@ -80,6 +96,7 @@ class Film:
     ) -> None:
         """Measure what is drawn of the first steps, beside a certified half width."""
         self.cars, self.last, self.corridor = cars, last, corridor
+        self.dt = cars[0].dt
         # Signed, left positive [m].
         self.deviations = [car.lateral[0, :last] for car in cars]
         peaks = [float(np.max(np.abs(one))) for one in self.deviations]
@@ -145,21 +162,14 @@ class Film:
         """Every car on its copy of the road, seen from the first car after a step."""
         envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
         friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
-        # White for a dry road, blue grey for a slippery one.
-        slippery = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
-        shade = 1.0 - slippery * np.array([0.14, 0.10, 0.05])
-        _put(axes, Rectangle((0, 0), 1, 1, fc=tuple(shade), **whole))
+        _put(axes, Rectangle((0, 0), 1, 1, fc=_surface(friction), **whole))
         for number in range(len(self.cars)):
             self._draw_car(axes, path, near, step + 1, number)
         _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
         if envs is not None:
             words = f"friction {friction:.2g}, wind {round(wind):+d} m/s"
             _put(axes, Text(0, 1.02, words, fontsize=9.5, clip_on=False, **whole))
-        if abs(wind) > 0.1:
-            middle = float(np.mean(axes.get_ylim()))
-            ends = [(0.93 * _AHEAD, middle + half * wind) for half in (-0.5, 0.5)]
-            arrow = {"arrowstyle": "-|>", "color": style.DARK, "lw": 2.5}
-            _put(axes, FancyArrowPatch(*ends, mutation_scale=10, **arrow))
+        _draw_wind(axes, wind, 0.93 * _AHEAD)
 
     def _draw_car(
         self, axes: Any, path: Any, near: list[Any], now: int, number: int
@@ -198,6 +208,129 @@ class Film:
         look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
         _put(axes, Text(4.5, shift[1, 0] - 2.3, style.literal(car.name), **look))
+
+
+class LaneFilm:
+    """A car in its lane, and the reference that it has committed to.
+
+    Seen along the road at the car. `corridor` and `reference` have been recorded.
+    """
+
+    def __init__(
+        self, scenario: Any, episode: Episode, *, dt: float, car: tuple[float, float]
+    ) -> None:
+        """Take an episode on a course; `car` is half of length and width [m]."""
+        self.dt, self.last, self.envs = dt, round(SECONDS / dt), scenario.envs
+        lane, obstacles = scenario.course[:2]
+        self.path, self.spacing = np.asarray(lane.path.points), float(lane.path.spacing)
+        # To the left of the middle [m].
+        self.edges = np.asarray(lane.left), -np.asarray(lane.right)
+        self.obstacles = [*zip(*map(np.asarray, obstacles), strict=True)]
+        self.states, self.car = np.asarray(episode.states), np.asarray(car)
+        self.along, self.signals = np.append(0.0, episode.progress), episode.signals
+        self.corridor = np.nan_to_num(episode.signals["corridor"])
+
+    def frames(self) -> Iterator[Image.Image]:
+        """The frames, each drawn over what is the same in all of them."""
+        figure = style.canvas(3.5)
+        # No layout engine: axes that shift between frames would make the film shake.
+        figure.set_layout_engine("none")
+        figure.set(figwidth=8.0, dpi=100)
+        axes = figure.add_axes((0.07, 0.225, 0.92, 0.68))
+        axes.set(xlim=_SIGHT, ylim=(-_SIDE, _SIDE), aspect="equal")
+        axes.set_xlabel("ahead of the car [m]", labelpad=1)
+        axes.set_ylabel("left of the middle [m]")
+        corridor = f"certified corridor, ± {self.corridor.min():.2f} m"
+        handles = [
+            Line2D([], [], **_REFERENCE, label="committed reference"),
+            Polygon([[0, 0]], **_CORRIDOR, label=corridor),
+            Polygon([[0, 0]], **_OBSTACLE, label="obstacle"),
+            Polygon([[0, 0]], **_INFLATED, label="plus half the car and corridor"),
+        ]
+        about: dict[str, Any] = {"loc": "lower center", "ncols": 4, "frameon": False}
+        figure.legend(handles=handles, fontsize=9, **about, columnspacing=1.4)
+        canvas: Any = figure.canvas
+        canvas.draw()
+        background = canvas.copy_from_bbox(figure.bbox)
+        for step in range(0, self.last, EVERY):
+            canvas.restore_region(background)
+            self._draw(axes, step)
+            yield Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
+
+    def _draw(self, axes: Any, step: int) -> None:
+        """Road, obstacles, corridor and car at a step."""
+        first, share = divmod(self.along[step] / self.spacing, 1.0)
+        first, state = int(first), self.states[step]
+        centre = (1.0 - share) * self.path[first] + share * self.path[first + 1]
+
+        def seen(points: Any, offset: Any = 0.0) -> np.ndarray:
+            """Places to the left of points with a yaw, along the road, (2, point)."""
+            left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
+            there = points[:, :2].T + offset * left
+            return _turn_by(centre[2]) @ (there - centre[:2, None])
+
+        around = slice(max(first - 40, 0), first + 120)
+        road = self.path[around]
+        edges = [seen(road, edge[around]) for edge in self.edges]
+        friction, wind = self.envs[step]
+        _put(axes, _between(*edges, fc=_surface(friction), ec="none"))
+        for edge in edges:
+            _put(axes, Line2D(*edge, color=style.DARK, lw=1.4))
+        _put(axes, Line2D(*seen(road), color="#aab1ba", lw=1.0, ls=(0, (6, 5))))
+        wide, every = self.corridor[step], np.asarray(self.signals["reference"])
+        # What it has followed, and what it follows next.
+        past = every[max(step - _TRAIL, 0) : step, 0]
+        ahead = np.concatenate([past, every[step]])
+        for place, yaw, half, radius, present in self.obstacles:
+            grown = radius + self.car[1] + wide
+            for size, look in ((grown, _INFLATED), (radius, _OBSTACLE)):
+                outline = _turn_by(-yaw) @ _rounded(half, size) + place[0][:, None]
+                if present:
+                    flat = seen(np.vstack([outline, outline[:1]]).T)
+                    _put(axes, Polygon(flat.T, **look))
+        _put(axes, _between(seen(ahead, wide), seen(ahead, -wide), **_CORRIDOR))
+        _put(axes, Line2D(*seen(ahead), **_REFERENCE))
+        turn = _turn_by(centre[2] - state[2])
+        for corners, look in _BODY:
+            body = turn @ (np.array(corners).T * self.car[:, None]) + seen(state[None])
+            _put(axes, Polygon(body.T, **look))
+        _draw_wind(axes, wind, 0.93 * _SIGHT[1])
+        whole: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
+        words = f"friction {friction:.1f}   wind {round(wind):+d} m/s"
+        free = max(float(self.signals["clearance"][step]), 0.0)
+        words = f"{step * self.dt:4.1f} s   {state[3]:4.1f} m/s   {words}"
+        words = f"{words}   keeps {free:.2f} m clear"
+        _put(axes, Text(0, 1.04, words, fontsize=11, **whole))
+        if self.signals["reference"][step, -1, 3] < state[3] - 0.5:
+            look = {"ha": "right", "fontweight": "bold", "color": "#d55e00"}
+            _put(axes, Text(1, 1.04, "brakes", fontsize=11, **look, **whole))
+
+
+def _between(one: Any, other: Any, **look: Any) -> Polygon:
+    """The area between two lines, (2, point)."""
+    return Polygon(np.hstack([one, other[:, ::-1]]).T, **look)
+
+
+def _rounded(half: Any, radius: float) -> Float[np.ndarray, "2 point"]:
+    """The outline of a box with round corners around the origin."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle)])
+    return radius * around + np.sign(around) * half[:, None]
+
+
+def _surface(friction: float) -> tuple[float, ...]:
+    """White for a dry road, blue grey for a slippery one."""
+    slippery = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
+    return tuple(1.0 - slippery * np.array([0.14, 0.10, 0.05]))
+
+
+def _draw_wind(axes: Any, wind: float, where: float) -> None:
+    """An arrow across the view, as long as the wind is strong."""
+    if abs(wind) > 0.1:
+        middle = float(np.mean(axes.get_ylim()))
+        ends = [(where, middle + half * wind) for half in (-0.5, 0.5)]
+        arrow = {"arrowstyle": "-|>", "color": style.DARK, "lw": 2.5}
+        _put(axes, FancyArrowPatch(*ends, mutation_scale=10, **arrow))
 
 
 def _put(axes: Any, artist: Any) -> None:
