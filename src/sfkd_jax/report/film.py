@@ -238,6 +238,7 @@ class LaneFilm:
         figure.set(figwidth=8.0, dpi=100)
         axes = figure.add_axes((0.07, 0.225, 0.92, 0.68))
         axes.set(xlim=_SIGHT, ylim=(-_SIDE, _SIDE), aspect="equal")
+        axes.set_facecolor("#e6e9e2")
         axes.set_xlabel("ahead of the car [m]", labelpad=1)
         axes.set_ylabel("left of the middle [m]")
         corridor = f"certified corridor, ± {self.corridor.min():.2f} m"
@@ -296,12 +297,13 @@ class LaneFilm:
             _put(axes, Polygon(body.T, **look))
         _draw_wind(axes, wind, 0.93 * _SIGHT[1])
         whole: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False}
-        words = f"friction {friction:.1f}   wind {round(wind):+d} m/s"
+        words = f"friction {friction:.1f}   wind {round(wind)} m/s"
         free = max(float(self.signals["clearance"][step]), 0.0)
         words = f"{step * self.dt:4.1f} s   {state[3]:4.1f} m/s   {words}"
         words = f"{words}   keeps {free:.2f} m clear"
         _put(axes, Text(0, 1.04, words, fontsize=11, **whole))
-        if self.signals["reference"][step, -1, 3] < state[3] - 0.5:
+        # In half a second.
+        if every[step, round(0.5 / self.dt) - 1, 3] < state[3] - 0.3:
             look = {"ha": "right", "fontweight": "bold", "color": "#d55e00"}
             _put(axes, Text(1, 1.04, "brakes", fontsize=11, **look, **whole))
 
