@@ -28,6 +28,8 @@ from sfkd_jax import export as exporting
 from sfkd_jax import settings as parsing
 from sfkd_jax.experiment import runs
 from sfkd_jax.export import __main__ as export
+from sfkd_jax.lanes import Lane, Obstacles
+from sfkd_jax.paths import Path as Road
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6
@@ -154,14 +156,10 @@ def in_process(loaded):
     return steps
 
 
-def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
-    """Of controls and states: with several platforms a product of matrices is a choice,
-    and XLA may round otherwise what is only reported.
-    """
-    manifest = json.loads((folder / "controller.json").read_text())
-    names = ("observations", "envs", "reference")
-    arrays = dict(zip(names, measurements(), strict=True))
-    np.savez(folder / "measured.npz", **arrays)
+def repeated(folder, observations, envs, **ahead):
+    """Leaves of every step of an export, by name, in a process without this package."""
+    given = {f"ahead/{name}": value for name, value in ahead.items()}
+    np.savez(folder / "measured.npz", observations=observations, envs=envs, **given)
     program = f"""
         import sys
         for name in {HEAVY!r}:
@@ -172,7 +170,8 @@ def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
         state, arrays = controller.init(seed=7), {{}}
         with np.load("measured.npz") as given:
             for k, (observation, env) in enumerate(zip(given["observations"], given["envs"])):
-                control, state, info = controller.act(state, observation, env, given["reference"])
+                ahead = {{name[6:]: given[name][k] for name in given.files if name[:6] == "ahead/"}}
+                control, state, info = controller.act(state, observation, env, ahead)
                 leaves = [control, *state.values(), *info.values()]
                 arrays |= {{f"{{k}}/{{i}}": np.asarray(leaf) for i, leaf in enumerate(leaves)}}
         np.savez("steps.npz", **arrays)
@@ -188,18 +187,89 @@ def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
         env=os.environ | {"XLA_FLAGS": ""},
     )
     assert done.returncode == 0, done.stderr
+    manifest = json.loads((folder / "controller.json").read_text())
     names = [leaf["name"] for leaf in manifest["programs"]["act"]["outputs"]]
-    healthy = []
     with np.load(folder / "steps.npz") as result:
-        assert len(result.files) == sum(map(len, in_process))
-        for k, leaves in enumerate(in_process):
-            for i, (name, ours) in enumerate(zip(names, leaves, strict=True)):
-                theirs = result[f"{k}/{i}"]
-                same = ours.tobytes() == theirs.tobytes()
-                assert same or name.startswith("info."), (k, name)
-                np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
-            healthy.append(bool(result[f"{k}/{names.index('info.healthy')}"]))
+        assert len(result.files) == len(names) * len(observations)
+        return [
+            {name: result[f"{k}/{i}"] for i, name in enumerate(names)}
+            for k in range(len(observations))
+        ]
+
+
+def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
+    """Of controls and states: with several platforms a product of matrices is a choice,
+    and XLA may round otherwise what is only reported.
+    """
+    observations, envs, reference = measurements()
+    steps = repeated(
+        folder, observations, envs, reference=np.stack([reference] * STEPS)
+    )
+    for step, leaves in zip(steps, in_process, strict=True):
+        for (name, theirs), ours in zip(step.items(), leaves, strict=True):
+            same = ours.tobytes() == theirs.tobytes()
+            assert same or name.startswith("info."), name
+            np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+    healthy = [bool(step["info.healthy"]) for step in steps]
     assert healthy == [True, True, True, False, True, True]
+
+
+def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
+    """Padding may hold anything, an obstacle that is not finite makes the car stop."""
+    shipped_policy = f"{sfkd_jax.__path__[0]}/pretrained/kinematic_lane"
+    few = policy.restore(shipped_policy).settings["controller"]
+    few = few | {"mppi": few["mppi"] | {"num_samples": 16}}
+    trained = sfkd_jax.load(shipped_policy, controller=few)
+    size = {"platforms": ("cpu",), "lane": (260, 2, 1), "car": (4.0, 1.8)}
+    manifest = exporting.write_controller(trained, tmp_path, **size)
+    shapes = {x["name"]: x["shape"] for x in manifest["programs"]["act"]["inputs"]}
+    assert (shapes["road"], shapes["position"]) == ((260, 4), (2, 1, 2))
+    assert manifest["car_m"] == [4.0, 1.8]
+    line = np.zeros((300, 4), np.float32)
+    line[:, 0] = 0.5 * np.arange(300) - 5.0
+    first = np.array([0, 0, 0, 0, 20])
+    observations = np.zeros((5, 4), np.float32)
+    observations[:, 0], observations[:, 3] = np.arange(5), 10.0
+    observations[2, 2] = np.nan
+    position = np.full((5, 2, 1, 2), np.nan, np.float32)
+    position[:, 0, 0] = 40.0, 0.5
+    position[3, 0] = np.nan
+    every = np.ones((5, 260), np.float32)
+    rows = {
+        "road": np.stack([line[i : i + 260] for i in first]),
+        "spacing": np.full(5, 0.5, np.float32),
+        "left": 5.0 * every,
+        "right": 5.0 * every,
+        "speed": 10.0 * every,
+        "position": position,
+        "yaw": np.zeros((5, 2), np.float32),
+        "half": np.zeros((5, 2, 2), np.float32),
+        "radius": np.full((5, 2), 0.8, np.float32),
+        "present": np.stack([[True, False]] * 5),
+        "moved": np.array([0, 0, 0, 0, 20]),
+    }
+    envs = np.full((5, 2), [0.9, 0.0], np.float32)
+    steps = repeated(tmp_path, observations, envs, **rows)
+    driver = trained.in_lane(car=(4.0, 1.8))
+    act, state = optimised(driver.act), driver.init(jax.random.key(7))
+    for k, step in enumerate(steps):
+        road, spacing, *lane = (rows[name][0] for name in [*rows][:5])
+        scene = (
+            Lane(Road(road, spacing), *lane),
+            Obstacles(*(rows[x][k] for x in [*rows][5:-1])),
+        )
+        control, state, info = act(
+            trained.params, state, observations[k], envs[k], scene
+        )
+        # The last step is of the window that has moved on.
+        same = {"rtol": 0.0, "atol": 0.0 if k < 4 else 1e-4}
+        np.testing.assert_allclose(step["control"], control, **same)
+        assert step["info.healthy"] == info["healthy"] == (k not in (2, 3))
+    assert steps[3]["info.stopping"]
+    ahead = steps[4]["state.progress"] - state.progress
+    np.testing.assert_allclose(ahead, -10.0, atol=1e-4)
+    with pytest.raises(ValueError, match=r"export.lane must be \[points"):
+        exporting.write_controller(trained, tmp_path, lane=(260, 2))
 
 
 def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(

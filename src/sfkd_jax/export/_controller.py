@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.export
@@ -16,8 +17,11 @@ import numpy as np
 from jaxtyping import Array
 
 from sfkd_jax import build, policy, store
+from sfkd_jax.lanes import Lane, Obstacles
+from sfkd_jax.paths import Path as Road
 from sfkd_jax.policy import Policy
-from sfkd_jax.ranges import Names
+from sfkd_jax.ranges import MayBeEmpty, Names, Positive
+from sfkd_jax.types import Controller
 
 FORMAT = 2
 """Version of the manifest and of the order of arguments; run_controller.py reads no
@@ -62,6 +66,8 @@ def write_controller(
     folder: Path,
     *,
     platforms: tuple[str, ...] = ("cpu", "cuda"),
+    lane: Annotated[tuple[int, ...], MayBeEmpty()] = (),
+    car: tuple[Positive, Positive] = (4.5, 2.0),
     iree: bool = False,
     iree_flags: Names = ("--iree-llvmcpu-target-cpu=host",),
 ) -> dict[str, Any]:
@@ -71,6 +77,9 @@ def write_controller(
         trained: the policy.
         folder: to write; an earlier export in it is replaced.
         platforms: that the programs are compiled for.
+        lane: (points of the road, obstacles, predicted steps of each) for a controller
+            that drives in a lane; () for one that follows a reference.
+        car: its length and width [m], for a lane.
         iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
     """
@@ -80,7 +89,10 @@ def write_controller(
             f"got {list(platforms)}"
         )
     # Everything that can refuse comes before the first file is written.
-    programs = flat_programs(trained)
+    ahead = None
+    if lane:
+        trained, ahead = in_window(trained, lane, car)
+    programs = flat_programs(trained, ahead)
     exported = {name: one.lower(*platforms) for name, one in programs.items()}
     modules = {
         name: _compile_iree(program.lower("cpu").mlir_module(), iree_flags)
@@ -117,6 +129,7 @@ def write_controller(
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
         **trained.interface,
+        "car_m": list(car) if lane else None,
         "parameters": sum(np.size(leaf) for leaf in jax.tree.leaves(trained.weights)),
         "settings": trained.settings,
         "versions": store.versions(),
@@ -151,18 +164,27 @@ def _certificate(trained: Policy, folder: Path, policy_sha256: str) -> str | Non
 # ---- programs
 
 
-def flat_programs(trained: Policy) -> dict[str, Program]:
+def flat_programs(
+    trained: Policy, ahead: Mapping[str, jax.ShapeDtypeStruct] | None = None
+) -> dict[str, Program]:
     """Return the programs of a controller, with folded weights inside.
 
         init: (key) -> state leaves
-        act: (state leaves, observation, env, reference)
+        act: (state leaves, observation, env, *ahead)
              -> (control, state leaves, info leaves)
 
     Names are paths, such as `state.plan` and `info.cost`. Keys are passed as their
     uint32 data.
+
+    Args:
+        trained: the policy.
+        ahead: what its controller takes after e, by name; None for a reference.
     """
     init, act = trained.controller
     key, state, *measured = _example_inputs(trained)
+    names = ["observation", "env", "reference"]
+    if ahead is not None:
+        names[2:], measured[2:] = ahead, ahead.values()
     wrap = partial(jax.random.wrap_key_data, impl=_key_implementation())
     # Flat and named: other programs know neither pytrees nor keys.
     template, structure = jax.tree.flatten(state)
@@ -171,16 +193,17 @@ def flat_programs(trained: Policy) -> dict[str, Program]:
         return tuple(_unpack(init(wrap(key_data))))
 
     def flat_act(*leaves: Array) -> tuple[Array, ...]:
-        *before, observation, env, reference = leaves
+        # What is measured follows the state.
         before = [
             wrap(leaf) if _is_key(like) else leaf
-            for like, leaf in zip(template, before, strict=True)
+            for like, leaf in zip(template, leaves, strict=False)
         ]
+        given = leaves[len(template) :]
         # Without the barrier XLA evaluates functions of the weights at compile time and
         # rounds differently.
         params = jax.lax.optimization_barrier(trained.params)
         control, after, info = act(
-            params, jax.tree.unflatten(structure, before), observation, env, reference
+            params, jax.tree.unflatten(structure, before), *given
         )
         return control, *_unpack(after), *jax.tree.leaves(info)
 
@@ -192,12 +215,58 @@ def flat_programs(trained: Policy) -> dict[str, Program]:
             "cannot export a controller whose state changes its structure, "
             "shapes or dtypes"
         )
-    names = ("observation", "env", "reference")
     inputs = (*states, *map(_leaf, names, measured))
     outputs = (_leaf("control", control), *states, *_named("info", info))
     return {
         "init": Program(flat_init, (_leaf("key", key),), states),
         "act": Program(flat_act, inputs, outputs),
+    }
+
+
+def in_window(
+    trained: Policy, lane: Sequence[int], car: tuple[float, float]
+) -> tuple[Policy, dict[str, jax.ShapeDtypeStruct]]:
+    """Return a policy in its lane that takes a scene as arrays, and their shapes.
+
+    The road is a window of points; `moved` tells by how many of them it has moved on
+    since the step before. It reaches from behind the car to beyond what is planned, or
+    the car stops at its end.
+    """
+    if len(lane) != 3 or min(lane) < 1:
+        raise ValueError(
+            "export.lane must be [points of the road, obstacles, predicted steps], "
+            f"got {list(lane)}"
+        )
+    driver, (points, count, steps) = trained.in_lane(car=(car[0], car[1])), lane
+    shapes: dict[str, tuple[int, ...]] = {
+        "road": (points, 4),
+        "spacing": (),
+        **dict.fromkeys(("left", "right", "speed"), (points,)),
+        "position": (count, steps, 2),
+        "yaw": (count,),
+        "half": (count, 2),
+        "radius": (count,),
+        "present": (count,),
+        "moved": (),
+    }
+
+    def act(
+        params: Any, state: Any, observation: Any, env: Any, *ahead: Array
+    ) -> tuple[Any, Any, Any]:
+        road, spacing, left, right, speed, *obstacles, moved = ahead
+        scene = Lane(Road(road, spacing), left, right, speed), Obstacles(*obstacles)
+        # Along the window of this step.
+        index = state.committed.index - moved
+        state = state._replace(
+            progress=state.progress - spacing * moved,
+            committed=state.committed._replace(index=index),
+        )
+        return driver.act(params, state, observation, env, scene)
+
+    kinds = {"present": bool, "moved": jnp.int32}
+    return replace(trained, controller=Controller(driver.init, act)), {
+        name: jax.ShapeDtypeStruct(shape, kinds.get(name, jnp.float32))
+        for name, shape in shapes.items()
     }
 
 

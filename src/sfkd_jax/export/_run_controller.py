@@ -33,6 +33,8 @@ FORMAT = 2
 """Version of controller.json that this file reads."""
 CELL = 2048.0
 """Spacing of the origins that positions are made relative to [m]."""
+PLACES = ("observation", "reference", "road", "position")
+"""Inputs that begin with x and y [m]; the third of all inputs is what is ahead."""
 MALFORMED = (
     *(KeyError, TypeError, ValueError, IndexError, AttributeError),
     *(OverflowError, RecursionError),
@@ -93,14 +95,19 @@ class ExportedController:
             state: from `init` or the previous step.
             observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
             env: (friction [-], lateral wind [m/s]).
-            reference: (horizon, 4): x, y, yaw, speed at the next steps.
+            reference: (horizon, 4): x, y, yaw, speed at the next steps; in a lane a
+                dict of all other inputs that the manifest lists.
             elapsed: sampling periods since the last call; None for one.
         """
-        measured = {"observation": observation, "env": env, "reference": reference}
-        given = {f"state.{name}": value for name, value in state.items()} | {
-            name: np.asarray(value) for name, value in measured.items()
-        }
         expected = self.manifest["programs"]["act"]["inputs"]
+        names = [x["name"] for x in expected if not x["name"].startswith("state.")]
+        measured = {"observation": observation, "env": env}
+        measured |= reference if isinstance(reference, dict) else {names[-1]: reference}
+        if set(measured) != set(names):
+            raise ValueError(f"inputs must be {names}, got {list(measured)}")
+        given = {f"state.{name}": value for name, value in state.items()} | {
+            name: np.asarray(measured[name]) for name in names
+        }
         # By name and order: two states may have the same shapes.
         if list(given) != [leaf["name"] for leaf in expected]:
             raise ValueError(
@@ -112,23 +119,24 @@ class ExportedController:
                     f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
                     f"got {value.shape}"
                 )
-        places = {name: given[name] for name in ("observation", "reference")}
+        places = {name: given[name] for name in PLACES if name in names}
         origin = np.zeros(2)
         # As `sfkd_jax.relative`: before the cast, and never of what was float32 before.
         if min(place.dtype.itemsize for place in places.values()) == 8:
-            near = np.nan_to_num(places["reference"][0, :2], posinf=0.0, neginf=0.0)
+            near = np.nan_to_num(given[names[2]][0, :2], posinf=0.0, neginf=0.0)
             origin = CELL * np.round(near / CELL)
             given |= {name: _shifted(place, -origin) for name, place in places.items()}
-        for name in given:
-            if name in measured:
-                given[name] = given[name].astype(np.float32)
+        for leaf in expected:
+            if (name := leaf["name"]) in measured:
+                given[name] = given[name].astype(leaf["dtype"])
             elif name.endswith("tuning.elapsed") and elapsed is not None:
                 given[name] = np.asarray(elapsed, np.float32)
         values = self._act(*given.values())
         state, info = (self._named("act", root, values) for root in ("state", "info"))
         if origin.any():
-            moved: Any = _shifted(info["predicted_states"], origin)
-            info["predicted_states"] = moved
+            for name in {"predicted_states", "reference"} & set(info):
+                moved: Any = _shifted(info[name], origin)
+                info[name] = moved
         return values[0], state, info
 
     def _key(self, seed: int) -> jax.Array:
@@ -219,16 +227,27 @@ def main() -> None:
     print(json.dumps(result | {"median_ms": float(np.median(times))}))
 
 
-def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, Any]:
     """Observation, environment and reference of a car 0.3 m beside a straight road."""
-    *_, observed, _, ahead = manifest["programs"]["act"]["inputs"]
-    speed, observation = 10.0, np.zeros(observed["shape"])
+    inputs = manifest["programs"]["act"]["inputs"]
+    arrays = {x["name"]: np.zeros(x["shape"], x["dtype"]) for x in inputs}
+    ahead = {name: x for name, x in arrays.items() if not name.startswith("state.")}
+    observation, _ = ahead.pop("observation"), ahead.pop("env")
+    speed, dt = 10.0, manifest["sampling_period_s"]
     observation[1], observation[3] = 0.3, speed
-    reference, dt = np.zeros(ahead["shape"]), manifest["sampling_period_s"]
-    reference[:, 0] = speed * dt * np.arange(1, len(reference) + 1)
-    reference[:, 3] = speed
+    line = next(iter(ahead.values()))
+    if "reference" in ahead:
+        line[:, 3], spacing = speed, speed * dt
+    else:
+        # A free lane.
+        spacing = 0.5
+        ahead |= {"spacing": np.asarray(spacing)}
+        ahead |= {name: ahead[name] + 5.0 for name in ("left", "right")}
+        ahead["speed"] = ahead["speed"] + speed
+    line[:, 0] = spacing * np.arange(1, len(line) + 1)
     box = manifest["environment"]
-    return observation, np.mean([box["low"], box["high"]], axis=0), reference
+    env = np.mean([box["low"], box["high"]], axis=0)
+    return observation, env, ahead
 
 
 if __name__ == "__main__":
