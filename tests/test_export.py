@@ -216,7 +216,7 @@ def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
 
 def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
     """Padding may hold anything, an obstacle that is not finite makes the car stop."""
-    shipped_policy = f"{sfkd_jax.__path__[0]}/pretrained/kinematic_lane"
+    shipped_policy = f"{sfkd_jax.__path__[0]}/pretrained/kinematic_path"
     few = policy.restore(shipped_policy).settings["controller"]
     few = few | {"mppi": few["mppi"] | {"num_samples": 16}}
     trained = sfkd_jax.load(shipped_policy, controller=few)
@@ -227,7 +227,7 @@ def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
     assert manifest["car_m"] == [4.0, 1.8]
     line = np.zeros((300, 4), np.float32)
     line[:, 0] = 0.5 * np.arange(300) - 5.0
-    first = np.array([0, 0, 0, 0, 20])
+    first = np.array([0, 0, 0, 0, 8])
     observations = np.zeros((5, 4), np.float32)
     observations[:, 0], observations[:, 3] = np.arange(5), 10.0
     observations[2, 2] = np.nan
@@ -246,7 +246,7 @@ def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
         "half": np.zeros((5, 2, 2), np.float32),
         "radius": np.full((5, 2), 0.8, np.float32),
         "present": np.stack([[True, False]] * 5),
-        "moved": np.array([0, 0, 0, 0, 20]),
+        "moved": first,
     }
     envs = np.full((5, 2), [0.9, 0.0], np.float32)
     steps = repeated(tmp_path, observations, envs, **rows)
@@ -267,7 +267,7 @@ def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
         assert step["info.healthy"] == info["healthy"] == (k not in (2, 3))
     assert steps[3]["info.stopping"]
     ahead = steps[4]["state.progress"] - state.progress
-    np.testing.assert_allclose(ahead, -10.0, atol=1e-4)
+    np.testing.assert_allclose(ahead, -4.0, atol=1e-4)
     with pytest.raises(ValueError, match=r"export.lane must be \[points"):
         exporting.write_controller(trained, tmp_path, lane=(260, 2))
 

@@ -4,18 +4,23 @@ import html
 import itertools
 import json
 import re
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pages_of_runs as made
 import pytest
 from PIL import Image, ImageSequence
 
+from sfkd_jax.evaluation import Episode
 from sfkd_jax.evaluation.metrics import METRICS, Metric
+from sfkd_jax.lanes import Obstacles, lane_along
+from sfkd_jax.paths import path_through
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.comparison import write_results_page
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
-from sfkd_jax.report.film import Film, film_of
+from sfkd_jax.report.film import Film, LaneFilm, film_of
 from sfkd_jax.report.pages import to_latex
 from sfkd_jax.report.run import write_report
 from sfkd_jax.store import ArtefactError
@@ -261,6 +266,32 @@ def test_a_film_of_cars_that_leave_or_break(tmp_path):
     nominal = film(2.0, states=states, lateral=lateral).cars[0]
     nominal = nominal._replace(row=made.row("nominal", "none"))
     assert film_of(tmp_path / "a.gif", [*film(2.0).cars, nominal])
+
+
+def test_a_film_of_a_lane_shows_what_stands_in_it_and_when_it_brakes():
+    def pixels(present=True, slower=0.0):
+        """How many of the last frame are an obstacle, and how many are orange."""
+        path = path_through(jnp.asarray([[0.0, 0.0], [60.0, 0.0]]))
+        box = Obstacles(
+            jnp.asarray([[[15.0, 1.0]]]),
+            *(jnp.asarray(one) for one in ([0.3], [[2.0, 1.0]], [0.5], [present])),
+        )
+        steps, ahead = 4, np.arange(1.0, 21.0)
+        window = np.stack([ahead, 0 * ahead, 0 * ahead, 10 - slower * ahead], axis=1)
+        along = np.arange(steps)[:, None, None] * np.eye(4)[0]
+        signals = {"reference": window + along}
+        signals |= dict.fromkeys(("corridor", "clearance"), np.full(steps, 0.12))
+        states = np.arange(5)[:, None] * np.eye(7)[0] + 10.0 * np.eye(7)[3]
+        road = SimpleNamespace(envs=np.full((steps, 2), [0.3, 8.0]))
+        road.course = lane_along(path, width=8.0), box
+        made = Episode(states, 0, 0, np.arange(1.0, 5.0), 0, signals)
+        *_, last = LaneFilm(road, made, dt=0.1, car=(2.25, 1.0)).frames()
+        colours = (0x57, 0x60, 0x6A), (0xD5, 0x5E, 0x00)
+        return [np.all(np.asarray(last) == one, axis=2).sum() for one in colours]
+
+    (solid, calm), (none, _), (_, braking) = pixels(), pixels(False), pixels(slower=0.2)
+    assert solid > none + 500
+    assert braking > calm + 20
 
 
 # ---- the page of a comparison

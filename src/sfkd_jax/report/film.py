@@ -220,7 +220,7 @@ class LaneFilm:
         self, scenario: Any, episode: Episode, *, dt: float, car: tuple[float, float]
     ) -> None:
         """Take an episode on a course; `car` is half of length and width [m]."""
-        self.dt, self.last, self.envs = dt, round(SECONDS / dt), scenario.envs
+        self.dt, self.envs = dt, np.asarray(scenario.envs)
         lane, obstacles = scenario.course[:2]
         self.path, self.spacing = np.asarray(lane.path.points), float(lane.path.spacing)
         # To the left of the middle [m].
@@ -229,6 +229,7 @@ class LaneFilm:
         self.states, self.car = np.asarray(episode.states), np.asarray(car)
         self.along, self.signals = np.append(0.0, episode.progress), episode.signals
         self.corridor = np.nan_to_num(episode.signals["corridor"])
+        self.last = min(round(SECONDS / dt), len(self.corridor))
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames, each drawn over what is the same in all of them."""
@@ -313,20 +314,20 @@ def _between(one: Any, other: Any, **look: Any) -> Polygon:
     return Polygon(np.hstack([one, other[:, ::-1]]).T, **look)
 
 
-def _rounded(half: Any, radius: float) -> Float[np.ndarray, "2 point"]:
+def _rounded(half: Any, radius: Any) -> Float[np.ndarray, "2 point"]:
     """The outline of a box with round corners around the origin."""
     angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     around = np.stack([np.cos(angle), np.sin(angle)])
     return radius * around + np.sign(around) * half[:, None]
 
 
-def _surface(friction: float) -> tuple[float, ...]:
+def _surface(friction: Any) -> tuple[float, ...]:
     """White for a dry road, blue grey for a slippery one."""
     slippery = float(np.clip((0.9 - friction) / 0.6, 0.0, 1.0))
     return tuple(1.0 - slippery * np.array([0.14, 0.10, 0.05]))
 
 
-def _draw_wind(axes: Any, wind: float, where: float) -> None:
+def _draw_wind(axes: Any, wind: Any, where: float) -> None:
     """An arrow across the view, as long as the wind is strong."""
     if abs(wind) > 0.1:
         middle = float(np.mean(axes.get_ylim()))
