@@ -97,7 +97,6 @@ def _row(row):
             {
                 "force_n": one["force_n"],
                 "rmse_mm": round(1e3 * one["rmse_m"]["mean"], 3),
-                "left_the_tube": one["v1"],
             }
             for one in row["disturbed"]
         ]

@@ -31,7 +31,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
     assert "proved: alpha" in done.stderr
     if system == "sfkd":
         assert own["rmse_m"]["mean"] < 0.5 * rows["nominal"]["rmse_m"]["mean"]
-        assert own["violation"]["v0"] == own["departures"] == 0
+        assert own["departures"] == 0
     else:
         file = demo.SHIPPED / "kinematic_path" / "certificate.json"
         corridor = json.loads(file.read_text())["corridor"]

@@ -20,7 +20,7 @@ SHIPPED = Path(__file__).with_name("pretrained")
 certificate, as `train` wrote them.
 """
 ALONG_PATH = "_path"
-PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s", "violation.v0")
+PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s")
 """Metrics of the table."""
 
 

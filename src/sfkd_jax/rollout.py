@@ -181,18 +181,10 @@ def windows(
     return jax.vmap(cut)(rows, starts)
 
 
-def sliding_windows(
-    trajectories: Trajectory, *, length: int, stride: int
-) -> Trajectory:
-    """Cut all windows of a batch, one trajectory after another.
-
-    Args:
-        trajectories: states (batch, T + 1, state).
-        length: steps of a window.
-        stride: steps between the starts of two windows.
-    """
+def adjacent_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
+    """Cut a batch, states (batch, T + 1, state), into windows without overlap."""
     count, steps = trajectories.controls.shape[:2]
-    starts = jnp.arange(0, steps - length + 1, stride)
+    starts = jnp.arange(0, steps - length + 1, length)
     rows = jnp.repeat(jnp.arange(count), starts.size)
     return windows(trajectories, rows, jnp.tile(starts, count), length=length)
 

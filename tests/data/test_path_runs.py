@@ -11,9 +11,9 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law
 
 from sfkd_jax import plants
-from sfkd_jax.data import check_on_path, generate_along_path, to_path
-from sfkd_jax.scenarios import DriveClass, path_from_curvature, random_drive
-from sfkd_jax.types import BODY, POSE, Trajectory
+from sfkd_jax.data import check_on_path, generate_along_path
+from sfkd_jax.scenarios import DriveClass, random_drive
+from sfkd_jax.types import BODY, POSE
 
 PLANT = plants.kinematic()
 LAW = any_law()
@@ -75,40 +75,6 @@ def test_runs_that_left_their_path_are_refused(runs):
     lost = lost._replace(controls=lost.controls.at[5, 3, 2].set(0.02))
     with pytest.raises(ValueError, match="1 of 64 runs left their path"):
         check_on_path(lost)
-
-
-def test_a_run_in_the_world_converts_to_path_coordinates():
-    """Driven by law + ν on its own projection: ν comes out again, and a loop step
-    explains every step.
-    """
-    path = path_from_curvature(0.015 * jnp.sin(0.5 * jnp.arange(300) / 25), spacing=0.5)
-    env, speed = jnp.asarray([0.8, 1.0]), jnp.asarray(9.0)
-    key = jax.random.key(0)
-    added = jnp.asarray([0.01, 0.2]) * jax.random.normal(key, (80, 2))
-
-    def step(world, nu):
-        one = to_path(
-            Trajectory(jnp.stack([world, world]), jnp.zeros((1, 2)), env[None]),
-            path,
-            LAW,
-            speed[None],
-        )
-        control = nu - one.controls[0, :2]
-        return PLANT.step(world, control, env), (world, control)
-
-    last, (states, controls) = jax.jit(partial(jax.lax.scan, step))(
-        jnp.asarray([5.0, 0.1, 0.0, 9.0]), added
-    )
-    driven = Trajectory(
-        jnp.concatenate([states, last[None]]), controls, jnp.tile(env, (80, 1))
-    )
-    along = jax.jit(lambda driven: to_path(driven, path, LAW, jnp.full(80, 9.0)))(
-        driven
-    )
-    np.testing.assert_allclose(along.controls[:, :2], added, atol=2e-3)
-    after = jax.vmap(LOOP.step)(along.states[:-1], along.controls, along.envs)
-    np.testing.assert_allclose(after[:, 3:], along.states[1:, 3:], atol=2e-3)
-    check_on_path(jax.tree.map(lambda leaf: leaf[None], along))
 
 
 def test_drives_of_every_group_stay_in_their_class_and_reach_its_ends():

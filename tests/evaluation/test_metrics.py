@@ -43,7 +43,6 @@ def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True, near=np.i
         controls=controls,
         lateral=np.asarray(lateral, dtype=float)[None],
         progress=np.zeros((1, steps)),
-        assumed_envs=np.zeros((1, steps, 2)),
         signals={
             "effective_samples": np.full((1, steps), ess),
             "healthy": np.full((1, steps), healthy),

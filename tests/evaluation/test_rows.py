@@ -16,7 +16,7 @@ def scored(level, count=4):
     return scores
 
 
-def made(level, system, *, count=4, violation=None, **changes):
+def made(level, system, *, count=4, **changes):
     about = {
         "system": system,
         "scenario": "s3",
@@ -26,17 +26,16 @@ def made(level, system, *, count=4, violation=None, **changes):
         "seeds": [0],
         **changes,
     }
-    return row(scored(level, count), about, violation or {})
+    return row(scored(level, count), about)
 
 
 def test_a_row_holds_every_measure_and_null_for_what_does_not_apply():
-    entry = made(0.1, "sfkd", violation={"v0": 0.0})
+    entry = made(0.1, "sfkd")
     measured = {metric.name for metric in METRICS if metric.measure}
-    given = {"violation", "ratio_to_oracle", "difference_to_sfkd"}
+    given = {"ratio_to_oracle", "difference_to_sfkd"}
     assert measured | given | {"system", "scenario", "seeds"} <= set(entry)
     np.testing.assert_allclose(entry["rmse_m"]["mean"], 0.115)
     np.testing.assert_allclose(entry["max_deviation_m"], 0.13)
-    assert entry["violation"] == {"v0": 0.0}
 
 
 def test_comparisons_are_ratios_to_the_oracle_and_paired_differences_to_ours():
@@ -73,12 +72,8 @@ def test_a_quadratic_program_is_paired_with_what_samples_around_feedback():
 
 
 def test_pooling_joins_the_episodes_of_all_seeds_and_averages_the_rest():
-    rows = [
-        made(level, "sfkd", seeds=[k], violation={"v0": level})
-        for k, level in enumerate((0.1, 0.3))
-    ]
+    rows = [made(level, "sfkd", seeds=[k]) for k, level in enumerate((0.1, 0.3))]
     pooled = pool(rows)
     assert pooled["seeds"] == [0, 1]
     np.testing.assert_allclose(pooled["rmse_m"]["mean"], 0.2 * 1.15)
-    np.testing.assert_allclose(pooled["violation"]["v0"], 0.2)
     assert pool(rows[:1]) == rows[0]

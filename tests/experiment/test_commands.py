@@ -51,7 +51,7 @@ def test_train_goes_from_nothing_to_a_report(smoke):
     assert 0.9 < document["alpha"] < 0.996
 
 
-def test_the_certificate_is_about_the_weights_and_the_theorem_is_never_violated(smoke):
+def test_the_certificate_is_about_the_weights(smoke):
     directory, document = smoke
     certificate = json.loads((directory / document["certificate"]).read_text())
     file = directory / document["run"] / "policy.safetensors"
@@ -60,13 +60,6 @@ def test_the_certificate_is_about_the_weights_and_the_theorem_is_never_violated(
     assert len(certificate["tube"]["latent"]) == 20
     assert set(certificate["d_bar"]["by_scenario"]) == {"uniform", "wet", "s3"}
     assert 1.0 <= certificate["tightness"] <= 1.1
-    violations = {
-        row["system"]: row["violation"]
-        for row in json.loads((directory / document["results"]).read_text())["rows"]
-    }
-    assert violations["sfkd"]["v0"] == 0.0
-    assert 0.0 <= violations["sfkd"]["v1"] <= 1.0
-    assert violations["nominal"]["v0"] is violations["nominal"]["v1"] is None
 
 
 def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):

@@ -33,7 +33,6 @@ def row(system, env="measured", scenario="s3", vehicle="kinematic", **more):
         "alpha": 0.93207 if own else None,
         "rmse_m": {"mean": mean, "std": 0.1 * mean, "ci95": [0.9 * mean, 1.1 * mean], "median": mean},
         "max_deviation_m": 4 * mean, "smoothness_rad_per_s": 0.081, "departures": 0,
-        "violation": {"v0": 0.0 if own else None, "v1": 0.1 if own else None},
         "difference_to_sfkd": None if own else {"mean": gap, "ci95": [gap - 1e-3, gap + 1e-3], "p_holm": 0.01},
     }  # fmt: skip
     return record | more

@@ -131,7 +131,7 @@ def test_hostile_names_are_text_on_every_page(tmp_path):
 def test_enemy_numbers_become_dashes_or_numbers(tmp_path):
     odd = [
         made.row("sfkd", rmse_m={"mean": value, "std": value, "ci95": [value, value]},
-                 max_deviation_m=value, violation={"v0": value}, inner_loop=str(value))
+                 max_deviation_m=value, inner_loop=str(value))
         for value in (None, 1e308, 5e-324, 0.0, -0.1, "x")
     ]  # fmt: skip
     run = made.write_run(tmp_path / "r", episodes=False, results={"rows": odd})
@@ -284,7 +284,7 @@ def test_a_film_of_a_lane_shows_what_stands_in_it_and_when_it_brakes():
         states = np.arange(5)[:, None] * np.eye(7)[0] + 10.0 * np.eye(7)[3]
         road = SimpleNamespace(envs=np.full((steps, 2), [0.3, 8.0]))
         road.course = lane_along(path, width=8.0), box
-        made = Episode(states, 0, 0, np.arange(1.0, 5.0), 0, signals)
+        made = Episode(states, 0, 0, np.arange(1.0, 5.0), signals)
         *_, last = LaneFilm(road, made, dt=0.1, car=(2.25, 1.0)).frames()
         colours = (0x57, 0x60, 0x6A), (0xD5, 0x5E, 0x00)
         return [np.all(np.asarray(last) == one, axis=2).sum() for one in colours]

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.data._logs import Log
-from sfkd_jax.geometry import PathFeedback, between, is_valid, path_state, wrap_angle
+from sfkd_jax.geometry import between, is_valid
 from sfkd_jax.rollout import windows
-from sfkd_jax.scenarios import Path, point_at, project
-from sfkd_jax.types import BODY, POSE, Key, Scalar, Space, State, Trajectory
+from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
 
 
 class Dataset(NamedTuple):
@@ -305,45 +304,6 @@ def spread_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
     # Fixed starts: validation losses of two trainings are comparable.
     starts = jnp.repeat(jnp.asarray([0, (steps - length) // 2, steps - length]), count)
     return windows(trajectories, rows, starts, length=length)
-
-
-def to_path(
-    driven: Trajectory, path: Path, law: PathFeedback, speeds: Float[Array, " time"]
-) -> Trajectory:
-    """Return one run as path states ξ_k and w_k = (u_k − law(ξ_k; …), κ_k, v_k).
-
-    Each state is projected onto the path by Newton steps from the foot point of the
-    state before, the first one from the nearest sample of the path. κ_k is the turn of
-    the path between two foot points over their distance.
-
-    Args:
-        driven: states (T + 1, state) in the world, applied controls, environments.
-        law: (ξ, κ, v_ref, e) -> u, not clipped.
-        speeds: v_ref [m/s], (T,).
-    """
-    states = driven.states
-
-    def follow(
-        carry: tuple[Scalar, State], state: State
-    ) -> tuple[tuple[Scalar, State], tuple[Scalar, Scalar]]:
-        s, before = carry
-        ahead = jnp.hypot(state[0] - before[0], state[1] - before[1])
-        s, lateral = project(path, state[:2], s + ahead)
-        return (s, state), (s, lateral)
-
-    nearest = jnp.argmin(jnp.hypot(*(path.points[:, :2] - states[0, :2]).T))
-    start = (nearest * path.spacing, states[0])
-    _, (progress, laterals) = jax.lax.scan(follow, start, states)
-    points = jax.vmap(point_at, in_axes=(None, 0))(path, progress)
-    headings = wrap_angle(states[:, 2] - points[:, 2])
-    coordinates = jnp.column_stack([laterals, headings, states[:, BODY]])
-    along, turned = jnp.diff(progress), wrap_angle(jnp.diff(points[:, 2]))
-    # A car that stands turns by 0 over 0: the curvature at its foot point instead.
-    moved = jnp.abs(along) > 1e-2
-    curvatures = jnp.where(moved, turned / jnp.where(moved, along, 1.0), points[:-1, 3])
-    feedback = jax.vmap(law)(coordinates[:-1], curvatures, speeds, driven.envs)
-    inputs = jnp.column_stack([driven.controls - feedback, curvatures, speeds])
-    return Trajectory(jax.vmap(path_state)(coordinates), inputs, driven.envs)
 
 
 def check_on_path(trajectories: Trajectory) -> None:

@@ -23,5 +23,3 @@ from sfkd_jax.evaluation._statistics import mean_interval as mean_interval
 from sfkd_jax.evaluation._statistics import p_value as p_value
 from sfkd_jax.evaluation._statistics import paired_difference as paired_difference
 from sfkd_jax.evaluation._statistics import summary as summary
-from sfkd_jax.evaluation._violations import ClaimedBounds as ClaimedBounds
-from sfkd_jax.evaluation._violations import violations as violations

@@ -41,8 +41,6 @@ class Episode(NamedTuple):
         lateral: signed distance of x_1 … x_T from the path [m], or from the reference
             that a controller of scenes follows, (time,).
         progress: arc length reached [m], (time,).
-        assumed_envs: e that the controller planned with, observed or estimated,
-            (time, environment).
         signals: what metrics and the caller recorded of every step, by name,
             (time, …).
     """
@@ -51,7 +49,6 @@ class Episode(NamedTuple):
     controls: Float[Array, "time control"]
     lateral: Float[Array, " time"]
     progress: Float[Array, " time"]
-    assumed_envs: Float[Array, "time environment"]
     signals: dict[str, Any]
 
 
@@ -122,10 +119,8 @@ def simulate(
                 follows = info["reference"]
                 bend = curvature_ahead(follows)[0]
                 lateral = path_coordinates(state, follows[0], bend)[LATERAL]
-        # An estimator reports what it planned with; others plan with what they see.
-        assumed = info.get("env_estimate", observed_env)
         signals = {name: signal(info) for name, signal in wanted.items()}
-        recorded = (state, control, lateral, progress, assumed, signals)
+        recorded = (state, control, lateral, progress, signals)
         return (state, progress, memory), recorded
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, wrap_angle
-from sfkd_jax.rollout import in_batches, rollout, sliding_windows, state_errors
+from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
 
@@ -27,7 +27,7 @@ def open_loop(
         trajectories: held out from training.
         horizon: steps.
     """
-    windows = sliding_windows(trajectories, length=horizon, stride=horizon)
+    windows = adjacent_windows(trajectories, length=horizon)
 
     def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
         predicted, true = rollout(model, params, window)[0], window.states[1:]

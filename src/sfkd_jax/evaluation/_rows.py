@@ -41,21 +41,16 @@ def score(episodes: Episode, *, dt: float) -> Scores:
     return {one.name: one.measure(recording) for one in METRICS if one.measure}
 
 
-def row(
-    scores: Scores,
-    about: dict[str, Any],
-    violation: dict[str, Any],
-) -> Row:
+def row(scores: Scores, about: dict[str, Any]) -> Row:
     """One system on one scenario; what does not apply is None.
 
     Args:
         scores: per episode.
         about: system, model, controller, sampling, env, scenario, vehicle, seeds,
             episodes, episode_s, params.
-        violation: from `violations`.
     """
     compared = dict.fromkeys(("ratio_to_oracle", "difference_to_sfkd"))
-    return about | _pooled(scores) | {"violation": violation} | compared
+    return about | _pooled(scores) | compared
 
 
 def _pooled(scores: Scores) -> Row:
@@ -63,15 +58,12 @@ def _pooled(scores: Scores) -> Row:
     return {one.name: one.pool(scores[one.name]) for one in METRICS if one.pool}
 
 
-def disturbed(
-    force: float, scores: Scores, violation: dict[str, Any]
-) -> dict[str, Any]:
+def disturbed(force: float, scores: Scores) -> dict[str, Any]:
     """The part of a row that is also measured under side forces up to `force` [N]."""
     pooled = _pooled(scores)
     return {
         "force_n": force,
         "rmse_m": pooled["rmse_m"],
-        **violation,
         "departures": pooled["departures"],
     }
 

@@ -199,8 +199,6 @@ METRICS: tuple[Metric, ...] = (
                [row["max_deviation_m"] for row in rows])))),
     Metric("smoothness_rad_per_s", "Steering rate", "rad/s", "tracking",
            measure=_steering_rate, pool=_mean),
-    Metric("violation.v0", "V0, theorem", "%", "claims", percent),
-    Metric("violation.v1", "V1, certified tube", "%", "claims", percent),
     Metric("departures", "Left the lane", "", "spread", short, _departed,
            lambda values: int(np.sum(values)),
            lambda rows: sum(row["departures"] for row in rows)),

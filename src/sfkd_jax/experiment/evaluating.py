@@ -1,4 +1,4 @@
-"""Evaluate systems: simulate paired episodes, score them and count violations."""
+"""Evaluate systems: simulate paired episodes and score them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from jaxtyping import Array
 
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
-from sfkd_jax.data import to_path
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
@@ -25,7 +24,7 @@ from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, unfold
 from sfkd_jax.scenarios import CAR, ROADS, Scenario
 from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.types import Controller, Key, Params, Scalar, Trajectory
+from sfkd_jax.types import Controller, Key
 
 
 class EpisodeSet(NamedTuple):
@@ -163,7 +162,6 @@ class SystemEvaluation:
         self.params = jax.jit(partial(fold, system.model))(system.params)
         self._system = system._replace(params=self.params)
         self._columns = _columns(settings, name, system)
-        self._claims = _claims(settings, system)
         simulate = partial(
             evaluation.simulate,
             plant.step,
@@ -174,20 +172,19 @@ class SystemEvaluation:
             observation_noise=settings.evaluation.observation_noise,
         )
         self._simulate = _over_episodes(simulate)
-        self._violated = jax.jit(self._violations)
 
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
-        episode, scores, violation = self._scored(episodes, 0.0)
+        episode, scores = self._scored(episodes, 0.0)
         about = {"scenario": episodes.name}
-        row = evaluation.row(scores, self._columns | about, violation)
+        row = evaluation.row(scores, self._columns | about)
         if forces := self._settings.evaluation.side_forces:
             row["disturbed"] = []
         for force in forces:
             # Without a force the episodes are those above, and not simulated again.
             if force:
-                _, scores, violation = self._scored(episodes, force)
-            row["disturbed"].append(evaluation.disturbed(force, scores, violation))
+                _, scores = self._scored(episodes, force)
+            row["disturbed"].append(evaluation.disturbed(force, scores))
         parts = ("lateral", "states", "controls")
         arrays = {part: getattr(episode, part) for part in parts}
         # With the roads: a page draws them without the settings.
@@ -197,7 +194,7 @@ class SystemEvaluation:
 
     def _scored(
         self, episodes: EpisodeSet, force: float
-    ) -> tuple[evaluation.Episode, evaluation.Scores, dict[str, Any]]:
+    ) -> tuple[evaluation.Episode, evaluation.Scores]:
         """Episodes under unmeasured side forces up to `force` [N], and their scores."""
         known = driven = episodes.scenarios
         if force:
@@ -207,39 +204,7 @@ class SystemEvaluation:
             envs = jax.jit(jax.vmap(disturb))(known.envs, episodes.keys)
             driven = known._replace(envs=envs)
         episode = self._simulate(driven, episodes.keys)
-        scores = evaluation.score(episode, dt=self._plant.dt)
-        violation: dict[str, Any] = dict.fromkeys(("v0", "v1"))
-        # A prediction needs as many steps as a segment of the data set has.
-        long = episode.controls.shape[1] >= self._settings.dataset.steps
-        if long and self._claims:
-            seen = Trajectory(episode.states, episode.controls, episode.assumed_envs)
-            shares = self._violated(self.params, seen, known, self._claims)
-            for name, share in jax.device_get(shares).items():
-                violation[name] = float(share) if np.isfinite(share) else None
-        return episode, scores, violation
-
-    def _violations(
-        self,
-        params: Params,
-        seen: Trajectory,
-        scenarios: Scenario,
-        claims: evaluation.ClaimedBounds,
-    ) -> dict[str, Scalar]:
-        """Violations of claims along episodes, in the coordinates of the model."""
-
-        def convert(episode: Trajectory, scenario: Scenario) -> Trajectory:
-            if self._system.law is None:
-                return episode
-            speeds = jnp.full(episode.controls.shape[0], scenario.speed)
-            return to_path(episode, scenario.path, self._system.law, speeds)
-
-        return evaluation.violations(
-            self._system.model,
-            params,
-            jax.vmap(convert)(seen, scenarios),
-            claims,
-            length=self._settings.dataset.steps,
-        )
+        return episode, evaluation.score(episode, dt=self._plant.dt)
 
 
 def has_course(settings: Settings) -> bool:
@@ -287,23 +252,6 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
         "params": sum(leaf.size for leaf in leaves) or None,
         "alpha": certificate["alpha"] if certificate else None,
     }
-
-
-def _claims(settings: Settings, system: System) -> evaluation.ClaimedBounds | None:
-    """Claims of the certificate of a system about its predictions, or None."""
-    level, horizon = settings.certification.level, settings.certification.horizon
-    # Those are about the middle of the road, which nobody follows on a course.
-    if system.certificate is None or has_course(settings):
-        return None
-    tube, d_bar = system.certificate["tube"], system.certificate["d_bar"]
-    if (len(tube["latent"]), d_bar["level"]) != (horizon, level):
-        store.print_message(
-            "  the certificate is of another horizon or level and is not compared"
-        )
-        return None
-    radii = [tube["physical"][kind] for kind in ("position_m", "yaw_rad", "body")]
-    latent = jnp.asarray(tube["latent"])
-    return evaluation.ClaimedBounds(jnp.asarray(radii).T, latent, d_bar["value"])
 
 
 def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
