@@ -113,7 +113,7 @@ def batch():
 
 def made(seed=0):
     about = {"system": "sfkd", "scenario": "s3", "seeds": [seed]}
-    return row(score(batch(), dt=DT), about, {})
+    return row(score(batch(), dt=DT), about)
 
 
 @pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
