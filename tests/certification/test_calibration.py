@@ -78,14 +78,21 @@ def test_segments_of_few_runs_give_the_interval_of_few_trials():
     assert wide[0] < narrow[0] < 0.95 < narrow[1] < wide[1]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_scores_that_are_not_finite_are_refused(value):
+def test_runs_without_a_bound_exceed_every_bound_and_too_many_are_refused():
+    """NaN is no score. An infinite one is that of a run in which a simulator failed."""
     table = scores(np.random.default_rng(0), 50)
-    spoiled = table.copy()
-    spoiled[3, 0] = value
-    for pair in ((table, spoiled), (spoiled, table)):
+    for value, failed in ((np.nan, 1), (np.inf, 5)):
+        spoiled = table.copy()
+        spoiled[:failed, 0] = value
         with pytest.raises(ValueError, match="not finite"):
-            conformal_bounds(*pair, level=0.9)
+            conformal_bounds(table, spoiled, level=0.9)
+        with pytest.raises(ValueError, match="not finite"):
+            conformal_bounds(spoiled, table, level=0.9)
+    few, largest = table.copy(), table.copy()
+    few[:4, 0], largest[:4, 0] = np.inf, 1e9
+    found = conformal_bounds(table, few, level=0.9)
+    np.testing.assert_array_equal(found, conformal_bounds(table, largest, level=0.9))
+    assert coverage(found, few)["coverage"] <= 46 / 50
 
 
 def largest(data):

@@ -90,17 +90,24 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
 def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
     """Return the ⌈(n+1) level⌉-th smallest of n scores.
 
-    A new, exchangeable score exceeds it with probability at most 1 − level.
+    A new, exchangeable score exceeds it with probability at most 1 − level. Infinite
+    scores are those of runs that no bound holds for.
     """
-    # An infinite score would be sorted last and silently dropped from the quantile.
-    if not np.all(np.isfinite(scores)):
+    if np.any(np.isnan(scores)):
         raise ValueError("residuals are not finite")
     if not supports(len(scores), level):
         raise ValueError(
             f"{len(scores)} calibration trajectories are too few for level {level}"
         )
     # (n + 1): the new trajectory counts as one of the exchangeable ones.
-    return float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
+    found = float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
+    # Too many runs without a bound: there is none at this level.
+    if found == math.inf:
+        raise ValueError(
+            f"residuals of {np.sum(np.isinf(scores))} of {len(scores)} runs are not "
+            f"finite: more than level {level} allows"
+        )
+    return found
 
 
 def supports(count: int, level: float) -> bool:

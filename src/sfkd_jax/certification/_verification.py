@@ -360,6 +360,8 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
             "over_corridor": Follows(attack["kept_lateral_m"] / width),
             "over_tube": Follows(attack["kept_distance_m"] / tube),
         },
+        # Of a simulator; they are in none of the bounds.
+        **{name: COUNT for name in ("failed_runs",) if name in corridor},
         # No farther than the runs of the attack reach.
         "shield_horizon": Measured(1, LENGTH, int),
         "seconds": SECONDS,

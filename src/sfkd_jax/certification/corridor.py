@@ -152,7 +152,7 @@ def certify_corridor(
     runs_of = partial(
         _driver, loop, limits, excited, jnp.repeat(jnp.arange(len(DRIVES)), runs)
     )
-    kinds = [runs_of(switching)] * 3 + [runs_of(from_s3(steps, dt))]
+    kinds = [runs_of(switching)] * 3 + [runs_of(from_s3(steps, dt, low, high))]
     simulate = jax.jit(partial(_simulate_nominal, loop))
     keys = zip(kinds, run_keys, jax.random.split(sensor_key, 4), strict=True)
     measured = [
@@ -161,6 +161,7 @@ def certify_corridor(
     ]
     units, calibration, test, s3 = (scores for *_, scores in measured)
     bounds, shares = _worst_group(units, calibration, test, level)
+    failed = sum(int(np.isinf(scores[:, 0]).sum()) for *_, scores in measured)
     lateral, nominal, _ = measured[2]
     conditions = {
         "env_box": [low, high],
@@ -175,9 +176,7 @@ def certify_corridor(
     bound = bounds["vehicle_to_nominal_position"]
     search = _Search(loop, claims["position"], bound, data, held, attack_steps)
     observe = jax.jit(partial(innovations, loop))
-    seen, seen_s3 = (
-        lambda key, kind=kind: observe(kind(key), key) for kind in kinds[2:]
-    )
+    seen, seen_s3 = (partial(_seen, kind, observe) for kind in kinds[2:])
     key = stream(ALARMS)
     alarms = calibrate_innovations(seen, seen_s3, key, duration=duration)
     return {
@@ -190,9 +189,10 @@ def certify_corridor(
         # S3 does not meet the conditions: reported beside the claim, never in it.
         "by_scenario": {"s3": corridor_coverage(bounds, s3)},
         "seen": {
-            "distance_m": float(np.max(np.abs(lateral - nominal))),
-            "lateral_m": float(np.max(np.abs(lateral))),
+            "distance_m": float(np.nanmax(np.abs(lateral - nominal))),
+            "lateral_m": float(np.nanmax(np.abs(lateral))),
         },
+        **({"failed_runs": failed} if failed else {}),
         "attack": _attack(search, attack_key, bounds["nominal"], horizon),
         "innovations": alarms,
         "shield_horizon": horizon,
@@ -224,6 +224,7 @@ def _worst_group(
     own, shares = {}, {}
     parts = [np.split(part, len(DRIVES)) for part in (units, calibration, test)]
     for name, unit, calibrated, _ in zip(DRIVES, *parts, strict=True):
+        unit = unit[np.isfinite(unit[:, 0])]
         own[name] = calibrate_corridor(unit, calibrated, level=level)
     bounds = {
         kind: max(each[kind] for each in own.values()) for kind in (*JOINT, *ALONE)
@@ -245,6 +246,7 @@ def _measure(
     """e_y of the car and ê_y of the nominal model (run, time), and scores of the runs.
 
     Scores are the smallest bounds that would have held on a run, `JOINT` and `ALONE`.
+    Where a simulator failed, none would have: the run counts as one outside.
     `simulate` is `_simulate_nominal`, compiled once for all batches of one size.
     """
     nominal, start = (np.asarray(part, np.float64) for part in simulate(runs, key))
@@ -253,7 +255,18 @@ def _measure(
     alone, together = ([each[form] for each in bounds] for form in FORMS)
     scores = [*together, np.max(np.abs(nominal), axis=1), *alone]
     lateral = np.asarray(runs.states, dtype=np.float64)[:, 1:, BODY][..., LATERAL]
-    return lateral, nominal, np.column_stack(scores)
+    scores = np.column_stack(scores)
+    scores[np.isnan(scores).any(axis=1)] = np.inf
+    return lateral, nominal, scores
+
+
+def _seen(runs_of: Callable[[Key], Trajectory], observe: Any, key: Key) -> Any:
+    """Innovations of runs; one in which a simulator failed is another one's again."""
+    runs = runs_of(key)
+    kept = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
+    rows = np.resize(np.flatnonzero(kept), len(kept))
+    rows = np.where(kept, np.arange(len(kept)), rows)
+    return jax.tree.map(lambda leaf: leaf[rows], observe(runs, key))
 
 
 def _simulate_nominal(
@@ -476,9 +489,9 @@ def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, 
         )
     return {
         "steps": search.steps,
-        "lateral_m": float(np.max(outcome.lateral)),
-        "distance_m": float(np.max(outcome.distance)),
-        "shielded_lateral_m": float(np.max(held.lateral)),
+        "lateral_m": float(np.nanmax(outcome.lateral)),
+        "distance_m": float(np.nanmax(outcome.distance)),
+        "shielded_lateral_m": float(np.nanmax(held.lateral)),
         "kept_lateral_m": lateral,
         "kept_distance_m": distance,
         "over_corridor": lateral / (width + bound),

@@ -104,8 +104,7 @@ def _simulate(settings: Settings) -> Dataset:
     trajectories = jax.jit(_generator(settings))(drive_key)
     along_path = bool(settings.along_path)
     labels = segment_scenarios(options.segments, along_path=along_path)
-    if getattr(settings.vehicle, "env", None):
-        trajectories, labels = _without_faults(trajectories, labels)
+    trajectories, labels = _without_faults(settings, trajectories, labels)
     if along_path:
         check_on_path(trajectories)
     return split(
@@ -118,11 +117,13 @@ def _simulate(settings: Settings) -> Dataset:
     )
 
 
-def _without_faults(runs: Trajectory, *more: Any) -> tuple[Any, ...]:
+def _without_faults(settings: Settings, runs: Trajectory, *more: Any) -> Any:
     """Drop the runs in which a simulator failed, and say how many they are."""
     states = np.asarray(runs.states)
     kept = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
-    if (lost := len(states) - len(kept)) == 0:
+    lost = len(states) - len(kept)
+    # Of a function of jax it is a fault of the vehicle, which others report.
+    if not lost or not getattr(settings.vehicle, "env", None):
         return runs, *more
     failed = f"the simulator failed in {lost} of {len(states)} runs"
     if not len(kept):
@@ -267,6 +268,7 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
     def lateral(step: Step) -> float:
         loop = build.build_loop(plant._replace(step=step), law)
         runs = jax.jit(partial(generate_along_path, loop, **options))(seed)
+        (runs,) = _without_faults(settings, runs)
         return 1e3 * float(jnp.sqrt(jnp.mean(runs.states[..., BODY.start] ** 2)))
 
     found, promised = lateral(plant.step), lateral(step)
@@ -301,6 +303,7 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
             **box,
         )
     )(run_key)
+    (runs,) = _without_faults(settings, runs)
     dataset = split(
         runs,
         split_key,
@@ -385,7 +388,8 @@ def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory
         simulate = jax.jit(_generator(settings, switching=True, segments=key[1]))
         seed = jax.random.key(settings.dataset.seed)
         # A stream of its own: S3 must not repeat what the training data drew.
-        _SWITCHING[key] = simulate(jax.random.fold_in(seed, SWITCHING))
+        runs = simulate(jax.random.fold_in(seed, SWITCHING))
+        (_SWITCHING[key],) = _without_faults(settings, runs)
     parts["s3"] = _SWITCHING[key]
     for code, name in enumerate(SCENARIOS):
         if (chosen := dataset.scenarios["test"] == code).any():
