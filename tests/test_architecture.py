@@ -82,8 +82,8 @@ LINES = {"src": 25_630, "tests": 15_500, "benchmarks, experiments": 2_500}
 """As they are; 20 000 and 15 000 are aimed at."""
 FILES_IN_SRC = 134
 
-OPTIONS, EXPERIMENTS = 66, 10
-COMMITTED = {"*.json": 1_070_000, "figures": 2_600_000}
+OPTIONS, EXPERIMENTS = 65, 10
+COMMITTED = {"*.json": 700_000, "figures": 1_900_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""
 LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9
