@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -40,18 +40,6 @@ class Biases(NamedTuple):
 
     gains: tuple[Float[Array, "_ control"], ...] = ()
     offsets: tuple[Float[Array, " _"], ...] = ()
-
-    @classmethod
-    def cut(
-        cls,
-        gains: Float[Array, "units control"],
-        offsets: Float[Array, " units"],
-        widths: Sequence[int],
-    ) -> Biases:
-        """Cut the gains and offsets of all units into those of layers."""
-        # Inner edges only, as `split` wants them.
-        edges = list(accumulate(widths))[:-1]
-        return cls(tuple(jnp.split(gains, edges)), tuple(jnp.split(offsets, edges)))
 
     def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
         """Return the biases for one scaled control."""

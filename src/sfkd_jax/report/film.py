@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ class Film:
         self.factor = int(np.clip(_HALF / self.largest, 1, _MOST))
 
     def frames(self) -> Iterator[Image.Image]:
-        """The frames, each drawn over what is the same in all of them."""
+        """The frames."""
         tall = 0.123 * _SPACING * len(self.cars)
         height = tall + 2.1
         figure = style.canvas(height)
@@ -117,16 +118,14 @@ class Film:
         road = figure.add_axes((0.125, 1 - (tall + 0.29) / height, 0.86, tall / height))
         errors = figure.add_axes((0.125, 0.49 / height, 0.86, 1.16 / height))
         self._draw_axes(road, errors)
-        canvas: Any = figure.canvas
-        canvas.draw()
-        background = canvas.copy_from_bbox(figure.bbox)
         points = np.asarray(self.cars[0].path)
         near = [_nearest(np.asarray(one.states)[:, :2], points) for one in self.cars]
-        for step in range(0, self.last, EVERY):
-            canvas.restore_region(background)
+
+        def draw(step: int) -> None:
             self._draw_road(road, points, near, step)
             self._draw_errors(errors, step)
-            yield Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
+
+        return _each(figure, range(0, self.last, EVERY), draw)
 
     def _draw_axes(self, road: Any, errors: Any) -> None:
         """What no frame changes: scales, corridor, dashes at switches."""
@@ -177,13 +176,11 @@ class Film:
         """One car on its copy of the road, its trail and its name."""
         car, lateral, own = self.cars[number], self.deviations[number], near[number]
         centre, states = path[near[0][now]], np.asarray(car.states)
-        turn, color = _turn_by(centre[2]), style.line(car.system)["color"]
-        shift = np.array([[0.0], [-_SPACING * number]])
+        color, shift = style.line(car.system)["color"], -_SPACING * number
 
         def seen(points: Any, offset: Any) -> np.ndarray:
             """Positions to the left of path points on this copy, (2, point)."""
-            left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
-            return turn @ (points[:, :2].T + offset * left - centre[:2, None]) + shift
+            return _seen(centre, points, offset) + np.array([[0.0], [shift]])
 
         around = path[max(int(near[0][now]) - 120, 0) : int(near[0][now]) + 160]
         for side, dashes in ((-_HALF, "-"), (0.0, (0, (6, 5))), (_HALF, "-")):
@@ -207,7 +204,7 @@ class Film:
         _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
         look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
-        _put(axes, Text(4.5, shift[1, 0] - 2.3, style.literal(car.name), **look))
+        _put(axes, Text(4.5, shift - 2.3, style.literal(car.name), **look))
 
 
 class LaneFilm:
@@ -232,7 +229,7 @@ class LaneFilm:
         self.last = min(round(SECONDS / dt), len(self.corridor))
 
     def frames(self) -> Iterator[Image.Image]:
-        """The frames, each drawn over what is the same in all of them."""
+        """The frames."""
         figure = style.canvas(3.5)
         # No layout engine: axes that shift between frames would make the film shake.
         figure.set_layout_engine("none")
@@ -251,26 +248,15 @@ class LaneFilm:
         ]
         about: dict[str, Any] = {"loc": "lower center", "ncols": 4, "frameon": False}
         figure.legend(handles=handles, fontsize=9, **about, columnspacing=1.4)
-        canvas: Any = figure.canvas
-        canvas.draw()
-        background = canvas.copy_from_bbox(figure.bbox)
-        for step in range(0, self.last, EVERY):
-            canvas.restore_region(background)
-            self._draw(axes, step)
-            yield Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
+        steps = range(0, self.last, EVERY)
+        return _each(figure, steps, partial(self._draw, axes))
 
     def _draw(self, axes: Any, step: int) -> None:
         """Road, obstacles, corridor and car at a step."""
         first, share = divmod(self.along[step] / self.spacing, 1.0)
         first, state = int(first), self.states[step]
         centre = (1.0 - share) * self.path[first] + share * self.path[first + 1]
-
-        def seen(points: Any, offset: Any = 0.0) -> np.ndarray:
-            """Places to the left of points with a yaw, along the road, (2, point)."""
-            left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
-            there = points[:, :2].T + offset * left
-            return _turn_by(centre[2]) @ (there - centre[:2, None])
-
+        seen = partial(_seen, centre)
         around = slice(max(first - 40, 0), first + 120)
         road = self.path[around]
         edges = [seen(road, edge[around]) for edge in self.edges]
@@ -307,6 +293,26 @@ class LaneFilm:
         if every[step, round(0.5 / self.dt) - 1, 3] < state[3] - 0.3:
             look = {"ha": "right", "fontweight": "bold", "color": "#d55e00"}
             _put(axes, Text(1, 1.04, "brakes", fontsize=11, **look, **whole))
+
+
+def _each(
+    figure: Any, steps: range, draw: Callable[[int], None]
+) -> Iterator[Image.Image]:
+    """Frames, each drawn over what is the same in all of them."""
+    canvas = figure.canvas
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    for step in steps:
+        canvas.restore_region(background)
+        draw(step)
+        yield Image.fromarray(np.array(canvas.buffer_rgba())[..., :3])
+
+
+def _seen(centre: Any, points: Any, offset: Any = 0.0) -> np.ndarray:
+    """Places to the left of points with a yaw, in the frame of a centre, (2, point)."""
+    left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
+    there = points[:, :2].T + offset * left
+    return _turn_by(centre[2]) @ (there - centre[:2, None])
 
 
 def _between(one: Any, other: Any, **look: Any) -> Polygon:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -197,7 +198,10 @@ class Learned(nn.Module):
     def _biases(self, flat: Array, widths: Sequence[int]) -> Biases:
         """Cut one flat vector into gains and offsets per layer."""
         table = flat.reshape(sum(widths), self.control + 1)
-        return Biases.cut(table[:, :-1], table[:, -1], widths)
+        # Inner edges only, as `split` wants them.
+        edges = list(accumulate(widths))[:-1]
+        gains, offsets = (jnp.split(x, edges) for x in (table[:, :-1], table[:, -1]))
+        return Biases(tuple(gains), tuple(offsets))
 
 
 def _couplings(
