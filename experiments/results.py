@@ -45,6 +45,8 @@ LABELS = {
     "icode_mppi_reads_env": "ICODE-MPPI, reads e",
     "icode_mppi_one_step": "ICODE-MPPI, one step",
     "law": "Law alone",
+    "law_nominal": "Law alone, of the nominal bicycle",
+    "law_plant": "Law alone, of the true plant",
     "nominal": "Nominal bicycle",
     "oracle": "Oracle",
 }

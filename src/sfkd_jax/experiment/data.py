@@ -36,7 +36,7 @@ from sfkd_jax.data import (
 from sfkd_jax.experiment.options import LogSettings, Settings
 from sfkd_jax.models import one_step
 from sfkd_jax.plants import Vehicle, check_step
-from sfkd_jax.settings import arguments, plain
+from sfkd_jax.settings import arguments, plain, replace
 from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import BODY, Key, Model, Step, Trajectory
 
@@ -224,6 +224,13 @@ def ensure_law(settings: Settings) -> PathLaw | None:
         law = jax.device_get(derive_law(settings))
         store.write_arrays(path, law._asdict(), kind=LAW, config=about)
     return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
+
+
+def with_law_of(settings: Settings, model: str) -> Settings:
+    """Return settings along a path whose law is derived from another model."""
+    dataset: Any = settings.dataset
+    law = replace(dataset.law, model=model)
+    return replace(settings, dataset=replace(dataset, law=law))
 
 
 def derive_law(settings: Settings) -> PathLaw:

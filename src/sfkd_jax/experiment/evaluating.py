@@ -106,7 +106,8 @@ def _over_episodes(
 def load_systems(settings: Settings) -> dict[str, System]:
     """Return the systems of `evaluation.systems` by name.
 
-    "self" is the policy of the run, which is trained if it is missing. With
+    "self" is the policy of the run, which is trained if it is missing; "law_nominal" is
+    "law" with the law that is derived from the nominal model, and so on. With
     `environment.source=estimated` every system that reads e estimates it.
     """
     plant = build.build_vehicle(settings.vehicle)
@@ -116,6 +117,9 @@ def load_systems(settings: Settings) -> dict[str, System]:
         if name == "self":
             systems[settings.model.system] = _policy_system(settings)
             continue
+        if settings.along_path and (whose := name.removeprefix("law_")) != name:
+            law = data.ensure_law(data.with_law_of(settings, whose))
+            references[name] = build.reference_systems(plant, law)["law"]
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
             system = system._replace(env_source="estimated")

@@ -12,7 +12,7 @@ from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, millimetr
 from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, Row
 from sfkd_jax.report.style import family, label, rank, scenario_label
 
-NO_MODEL = ("nominal", "oracle", "law")
+NO_MODEL = ("nominal", "oracle", "law", "law_nominal", "law_plant")
 """Systems without a learned model; their names imply whether they observe e."""
 SAMPLINGS = {
     "feedback": "sampling around a feedback law",
