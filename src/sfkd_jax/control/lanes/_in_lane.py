@@ -43,6 +43,8 @@ from sfkd_jax.types import (
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
 GRAVITY = 9.81
+TOLERANCE = 0.02
+"""Of limits of the class, relative: what is committed is judged at every step."""
 LOST = 10.0
 """Distance from where the car should be, at which it is somewhere else [m]."""
 
@@ -57,6 +59,8 @@ class LaneState(NamedTuple):
         progress: of the car along the path of the lane [m].
         wait: number of steps until the next search.
         started: whether there is a reference.
+        evading: whether it is one outside the class.
+        doubt: number of steps until a corridor may be claimed again.
     """
 
     inner: Any
@@ -65,6 +69,8 @@ class LaneState(NamedTuple):
     progress: Scalar
     wait: Int[Array, ""]
     started: Bool[Array, ""]
+    evading: Bool[Array, ""]
+    doubt: Int[Array, ""]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,14 +79,17 @@ class InLane:
 
     The planner compares references with the one that is committed; the cheapest that is
     admissible is committed. If none is, the committed one stays as long as it is free,
-    else the car brakes on it, to stand in front of what is in the way. A scene with
-    numbers that are not finite also makes it stop.
+    else the car brakes on it, to stand in front of what is in the way. If it would not
+    stand in time, it evades with the grip, outside the class and without a claim:
+    `corridor` and `clearance` are then NaN. A scene with numbers that are not finite
+    makes it stop.
 
     `act` takes a scene, lane and obstacles, in place of the reference. `info` gains
     `reference` (the window that `inner` follows), `offset` of the reference from the
     centre line [m], `clearance` (along the whole committed reference the car stays as
     far from all obstacles [m]; NaN where no corridor holds), `admissible` (the
-    committed reference is inside the class, the lane, and free) and `stopping`.
+    committed reference is inside the class, the lane, and free), `stopping` and
+    `evading` (what is committed is outside the class).
 
     Attributes:
         inner: in the world; its `info` has the `corridor` of the reference.
@@ -94,6 +103,7 @@ class InLane:
         lead: time by which the speed of the reference is ahead of its position [s]: a
             law follows a falling speed that much later.
         better: relative gain of a reference that replaces the committed one.
+        trial: number of steps without a claim after an evasion.
     """
 
     inner: Controller
@@ -106,6 +116,7 @@ class InLane:
     lowest: Positive = 0.3
     lead: NonNegative = 0.0
     better: NonNegative = 0.01
+    trial: AtLeastOne = 20
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -125,6 +136,8 @@ class InLane:
             progress=jnp.zeros(()),
             wait=jnp.zeros((), jnp.int32),
             started=jnp.asarray(False),
+            evading=jnp.asarray(False),
+            doubt=jnp.zeros((), jnp.int32),
         )
 
     def act(
@@ -144,32 +157,42 @@ class InLane:
         free = ~jnp.any(kept.blocked)
         # What was committed is judged at every step: what appears is seen at once.
         due = (state.wait <= 0) | ~free
-        planner, committed = jax.lax.cond(
+        planner, committed, taken = jax.lax.cond(
             due,
             lambda: self._search(state.planner, situation, kept, free),
-            lambda: (state.planner, situation.committed),
+            lambda: (state.planner, situation.committed, jnp.asarray(False)),
         )
         judged = task.judge(weights, situation, committed)
+        # What was admissible stays so; rounding aside, a last resort need not be.
+        left = jnp.where(free, state.evading, judged.outside > TOLERANCE)
+        evading = left & ~taken
+        doubt = jnp.where(evading, self.trial, jnp.maximum(state.doubt - 1, 0))
         times = task.dt * jnp.arange(1, self.horizon + 1)
         at = partial(window, path, committed, judged.curve, situation.place)
         ahead = at(times).at[:, 3].set(at(times + self.lead)[:, 3])
         given = state.inner, observation, env, ahead
         control, inner, info = self.inner.act(params, *given)
+        # Outside the class, and until its errors have decayed, nothing is certified.
+        corridor = jnp.where(doubt > 0, jnp.nan, info.get("corridor", jnp.nan))
         # What was needed is the corridor of the certificate; here is that of the step.
-        excess = info.get("corridor", jnp.nan) - task.kind.corridor
+        excess = corridor - task.kind.corridor
         room = jnp.min(judged.gap) - excess
         report: Any = {
             **info,
-            "healthy": info["healthy"] & clean,
+            "healthy": info["healthy"] & clean & (doubt == 0),
+            "corridor": corridor,
             "reference": ahead,
             "offset": committed.move[0, BEHIND],
             "clearance": jnp.where(clean, room, jnp.nan),
             "admissible": judged.violation <= 0.0,
             "stopping": ~judged.curve.reached[-1],
+            "evading": evading,
         }
         wait = jnp.where(due, self.period, state.wait) - 1
         started = state.started | all_finite(observation)
-        after = LaneState(inner, planner, committed, progress, wait, started)
+        after = LaneState(
+            inner, planner, committed, progress, wait, started, evading, doubt
+        )
         return control, after, report
 
     def _situation(
@@ -215,8 +238,8 @@ class InLane:
 
     def _search(
         self, planner: Any, situation: Situation, kept: Judged, free: Bool[Array, ""]
-    ) -> tuple[Any, Committed]:
-        """Return the state of the planner and the reference to commit."""
+    ) -> tuple[Any, Committed, Bool[Array, ""]]:
+        """Return the state of the planner, the reference to commit, if it was found."""
         task, before = self.manoeuvres, situation.committed
         # Its observation is a situation; it needs neither e nor a reference.
         act: Any = self.planner.act
@@ -235,9 +258,13 @@ class InLane:
         after = after._replace(plan=rows[chosen][None])
         better = costs[chosen] < (1.0 - self.better) * kept.cost
         taken = (better | (kept.violation > 0.0)) & jnp.isfinite(costs[chosen])
-        stop = task.stop(situation, kept)
-        otherwise = jax.tree.map(partial(jnp.where, free), before, stop)
-        return after, jax.tree.map(partial(jnp.where, taken), found, otherwise)
+        otherwise = jax.lax.cond(
+            taken | free,
+            lambda: before,
+            lambda: task.last_resort(planner.tuning.cost, situation, kept),
+        )
+        committed = jax.tree.map(partial(jnp.where, taken), found, otherwise)
+        return after, committed, taken
 
 
 def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:

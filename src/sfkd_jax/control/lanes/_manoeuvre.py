@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -31,6 +32,10 @@ SHORTEST = 12.0
 """Of a lateral move [m]."""
 ALMOST = 0.95
 """Share of the grip of a stop that cannot be gentler."""
+ENDS, LENGTHS, BRAKING = 11, (0.7, 0.85, 1.0, 1.25), (0.0, 0.4, 0.8)
+"""Of evasions: how many offsets they end at; lengths, relative to the one that takes
+all of the grip; shares of what it then leaves for the brakes.
+"""
 LATE = 0.03
 """Distances are those at samples; in between an obstacle may be nearer by less [m]."""
 
@@ -53,6 +58,8 @@ class Class:
         deceleration: largest in a planned change of speed [m/s²].
         braking: largest of a stop that cannot be gentler [m/s²].
         share: of the grip that is planned with.
+        evasive: share of the grip of an evasion, which leaves the class.
+        tracked: largest v² κ of one, which the law can still follow [m/s²].
     """
 
     curvature: Positive
@@ -68,6 +75,8 @@ class Class:
     deceleration: Positive = 1.0
     braking: Positive = 6.0
     share: Fraction = 0.7
+    evasive: Fraction = 0.85
+    tracked: Positive = 3.0
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -107,6 +116,7 @@ class Judged(NamedTuple):
         gap: what obstacles leave beyond what is needed [m], (sample,).
         edge: what the edges leave [m], (sample,).
         curve: in the world.
+        strain: how much it uses of what tyres and law can do at most.
     """
 
     cost: Scalar
@@ -114,6 +124,12 @@ class Judged(NamedTuple):
     gap: Float[Array, " sample"]
     edge: Float[Array, " sample"]
     curve: Curve
+    strain: Scalar
+
+    @property
+    def room(self) -> Scalar:
+        """What obstacles and edges leave at least [m]."""
+        return jnp.min(jnp.minimum(self.gap, self.edge))
 
     @property
     def blocked(self) -> Bool[Array, " sample"]:
@@ -123,8 +139,7 @@ class Judged(NamedTuple):
     @property
     def violation(self) -> Scalar:
         """How far it is from being admissible, 0 if it is."""
-        room = jnp.min(jnp.minimum(self.gap, self.edge))
-        return jnp.maximum(jnp.maximum(self.outside, -room), 0.0)
+        return jnp.maximum(jnp.maximum(self.outside, -self.room), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +270,57 @@ class Manoeuvres:
         square = jnp.where(samples < BEHIND, before.square, square)
         return before._replace(square=square)
 
+    def last_resort(
+        self, weights: Any, situation: Situation, kept: Judged
+    ) -> Committed:
+        """Return what to do where nothing of the class is free.
+
+        The stop, if that is free or nothing is clear of all in view. Else what stays
+        farthest: stop, committed reference, or a lateral move, also braked.
+        """
+        road, plans = situation.road, [self.stop(situation, kept), situation.committed]
+        room = self.kind.half[1] + self.kind.margin
+        left, right = road.left[SPLICE] - room, room - road.right[SPLICE]
+        ends = right + (left - right) * jnp.linspace(0.0, 1.0, ENDS)
+        rest = jnp.asarray([*product(LENGTHS, BRAKING)])
+        rows = [jnp.repeat(ends, len(rest)), *jnp.tile(rest.T, ENDS)]
+        moves = jax.vmap(partial(self._evasion, situation))(*rows)
+        plans = jax.tree.map(lambda *one: jnp.stack(one), *plans)
+        plans = jax.tree.map(lambda *some: jnp.concatenate(some), plans, moves)
+        judged = jax.vmap(partial(self.judge, weights, situation))(plans)
+        room = jax.vmap(lambda one: one.room)(judged)
+        beyond = 10.0 * jnp.maximum(judged.strain - 1.0, 0.0)
+        worth = jnp.minimum(room, self.comfort) - beyond - 0.05 * judged.strain
+        # What hits in any case brakes.
+        clear = (room[0] < 0.0) & (jnp.max(worth) > -self.kind.margin)
+        chosen = jnp.where(clear, jnp.argmax(worth), 0)
+        return jax.tree.map(lambda leaf: leaf[chosen], plans)
+
+    def _evasion(
+        self, situation: Situation, end: Scalar, longer: Scalar, braking: Scalar
+    ) -> Committed:
+        """A lateral move with the grip, to an offset, and braking with what it leaves.
+
+        Of a quintic from rest to rest the largest d'' is 5.77 |Δd| / ℓ².
+        """
+        road, before, kind = situation.road, situation.committed, self.kind
+        start, count = before.square[BEHIND], before.square.shape[0]
+        grip = kind.evasive * situation.grip
+        pull = jnp.minimum(grip, kind.tracked)
+        # At low speed it ends where the class does.
+        most = jnp.minimum(pull / jnp.maximum(start, 0.01), kind.curvature)
+        aside = jnp.abs(end - before.move[0, SPLICE])
+        length = jnp.maximum(longer * jnp.sqrt(5.77 * aside / most), 5.0)
+        ahead = road.spacing * jnp.arange(count - SPLICE)
+        moved = quintic(before.move[:, SPLICE], end, length, ahead)[:3]
+        move = jnp.concatenate([before.move[:, :SPLICE], moved], axis=1)
+        along = curve(road, Committed(before.index, move, before.square))
+        left = jnp.maximum(grip**2 - (start * along.curvature) ** 2, 0.0)
+        lost = 2.0 * road.spacing * braking * jnp.cumsum(jnp.sqrt(left)[BEHIND:])
+        square = jnp.clip(start - lost, 0.0, road.wanted[BEHIND:])
+        square = jnp.concatenate([before.square[: BEHIND + 1], square[:-1]])
+        return Committed(before.index, move, square)
+
     def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
         """Return what a reference costs, how far it leaves the class, and its room."""
         road, kind, square = situation.road, self.kind, plan.square
@@ -272,8 +338,11 @@ class Manoeuvres:
                 square / kind.speed[1] ** 2,
             ]
         )
+        pull = jnp.hypot(square * curvature, change) / (ALMOST * situation.grip)
+        pull = jnp.maximum(pull, square * jnp.abs(curvature) / kind.tracked)
         # What is before the splice cannot be changed any more.
         outside = jnp.max(jnp.where(along.reached, shares, 0.0)[:, SPLICE:]) - 1.0
+        strain = jnp.max(jnp.where(along.reached, pull, 0.0)[SPLICE:])
         gap, edge = self._room(situation, plan.move, along)
         costs = jnp.stack(
             [
@@ -285,7 +354,7 @@ class Manoeuvres:
             ]
         )
         cost = road.spacing * jnp.sum(weights @ costs[:, BEHIND:])
-        return Judged(cost, outside, gap, edge, along)
+        return Judged(cost, outside, gap, edge, along, strain)
 
     def _room(
         self, situation: Situation, move: Float[Array, "3 sample"], along: Curve
