@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.paths import Path
 
@@ -107,26 +107,62 @@ def clearance(
         direction: cosine and sine of the yaw of the box.
         half: half of its length and width [m]; 0 for a point.
     """
-    return jax.vmap(lambda one: distance(one, position, step, direction, half))(
-        obstacles
-    )
+    return jax.vmap(
+        lambda one: distance(one, place_at(one, step), position, direction, half)
+    )(obstacles)
+
+
+def place_at(
+    obstacle: Obstacles, step: Float[Array, ...] | float
+) -> tuple[Float[Array, ...], Float[Array, ...]]:
+    """Return where one obstacle, a row of `Obstacles`, is after some steps [m]."""
+    places, last = obstacle.position, obstacle.position.shape[0] - 1
+    if not last:
+        # What stands still is not looked up for every sample.
+        return places[0, 0], places[0, 1]
+    step = jnp.clip(step, 0.0, last)
+    index = jnp.floor(step).astype(int)
+    gone = jnp.diff(places, axis=0, append=places[-1:])
+    columns = *places.T, *gone.T
+    x, y, dx, dy = (column.at[index].get(mode="clip") for column in columns)
+    share = step - index
+    return x + share * dx, y + share * dy
+
+
+def beside(
+    obstacles: Obstacles,
+    line: Float[Array, "2 point"],
+    direction: Float[Array, "2 point"],
+    step: Float[Array, " point"],
+) -> tuple[Int[Array, " obstacle"], Float[Array, " obstacle"]]:
+    """Return the point of a line that is nearest to each obstacle at that point's time.
+
+    Args:
+        obstacles: (obstacle,).
+        line: positions [m].
+        direction: cosine and sine of its yaw.
+        step: number of steps from now at each point.
+
+    Returns:
+        Index of the point; distance of the obstacle to the left of it [m].
+    """
+    x, y = jax.vmap(lambda one: place_at(one, step))(obstacles)
+    x, y = (place.reshape(len(place), -1) for place in (x, y))
+    x, y = x - line[0], y - line[1]
+    nearest = jnp.argmin(jnp.hypot(x, y), axis=1)
+    left = direction[0] * y - direction[1] * x
+    return nearest, left[jnp.arange(len(left)), nearest]
 
 
 def distance(
     obstacle: Obstacles,
+    place: tuple[Float[Array, ...], Float[Array, ...]],
     position: Float[Array, "2 ..."],
-    step: Float[Array, ...] | float,
     direction: Float[Array, "2 ..."] | tuple[float, float],
     half: tuple[float, float],
 ) -> Float[Array, ...]:
-    """Return the `clearance` from one obstacle, a row of `Obstacles`."""
-    places, last = obstacle.position, obstacle.position.shape[0] - 1
-    # What stands still is not looked up for every sample.
-    step = jnp.clip(step if last else 0.0, 0.0, last)
-    index = jnp.floor(step).astype(int)
-    place, after = places[index].T, places[jnp.minimum(index + 1, last)].T
-    moved = place + (step - index) * (after - place)
-    x, y = (a - b for a, b in zip(moved, position, strict=True))
+    """Return the `clearance` from one obstacle, a row of `Obstacles`, at its place."""
+    x, y = (a - b for a, b in zip(place, position, strict=True))
     (cos, sin), (length, width) = direction, obstacle.half
     their_cos, their_sin = jnp.cos(obstacle.yaw), jnp.sin(obstacle.yaw)
     parallel = jnp.abs(their_cos * cos + their_sin * sin)

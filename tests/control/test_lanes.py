@@ -216,14 +216,22 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, pl
         )
 
 
-def test_where_nothing_is_admissible_it_stops_in_front_and_goes_on_later(lane, road):
-    wall = circles(
-        beside(road, np.array([[70.0, d] for d in np.arange(-6.0, 6.1, 1.5)])), 0.8
+@pytest.mark.parametrize("wall", ["one", "many"])
+def test_where_nothing_is_admissible_it_stops_and_goes_on_later(lane, road, wall):
+    """In front of what nothing can pass; far enough to turn from what one could."""
+    many = np.array([[70.0, d] for d in np.arange(-6.0, 6.1, 1.5)])
+    wall, goes = (
+        circles(beside(road, many), 0.8),
+        many[:, 1] <= (9.0 if wall == "one" else 0.0),
     )
+    one, wall = wall == "one", circles(beside(road, many), 0.8)
+    if one:
+        boxes = jnp.tile(jnp.asarray([0.8, 6.0]), (9, 1))
+        wall = wall._replace(half=boxes, radius=jnp.zeros(9))
     stood = []
 
     def seen(number, car):
-        return wall._replace(present=jnp.full(9, number < 150))
+        return wall._replace(present=jnp.asarray((number < 150) | ~goes))
 
     rows = drive(lane, road, seen, 200, friction=0.6)
     for number, (car, _, info) in enumerate(rows[:150]):
@@ -231,7 +239,8 @@ def test_where_nothing_is_admissible_it_stops_in_front_and_goes_on_later(lane, r
         assert bool(info["stopping"]) or number == 0
         stood.append(car[3])
     assert stood[-1] == 0.0
-    assert 0.7 < room(rows[149][0], wall) < 2.5
+    near, far = (0.7, 2.5) if one else (20.0, 50.0)
+    assert near < room(rows[149][0], wall) < far
     assert np.diff(stood).min() > -0.7 * 9.81 * 0.6 * DT - 0.05
     assert rows[-1][0][3] > 1.5
     assert not bool(rows[-1][2]["stopping"])

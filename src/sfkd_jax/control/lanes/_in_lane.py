@@ -281,7 +281,7 @@ def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:
 
     def shown(leaf: Array) -> Array:
         present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(present, leaf, 0)
+        return jnp.where(present, leaf, jnp.zeros_like(leaf))
 
     scene = lane, Obstacles(*map(shown, obstacles))
     whole = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)

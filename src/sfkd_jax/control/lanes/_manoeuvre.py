@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.lanes._reference import (
     BEHIND,
@@ -23,7 +23,7 @@ from sfkd_jax.control.lanes._reference import (
 )
 from sfkd_jax.control.tasks._constraints import constrained
 from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task
-from sfkd_jax.lanes import Obstacles, distance
+from sfkd_jax.lanes import Obstacles, beside, distance, place_at
 from sfkd_jax.paths import quintic
 from sfkd_jax.ranges import Fraction, NonNegative, Positive, Span, check_intervals
 from sfkd_jax.types import Control, Params, Scalar
@@ -32,6 +32,8 @@ SHORTEST = 12.0
 """Of a lateral move [m]."""
 ALMOST = 0.95
 """Share of the grip of a stop that cannot be gentler."""
+BEND = 5.77
+"""Largest second derivative of a quintic between rests, by its height and length²."""
 ENDS, LENGTHS, BRAKING = 11, (0.7, 0.85, 1.0, 1.25), (0.0, 0.4, 0.8)
 """Of evasions: how many offsets they end at; lengths, relative to the one that takes
 all of the grip; shares of what it then leaves for the brakes.
@@ -220,22 +222,11 @@ class Manoeuvres:
         Of the next two obstacles both, or the second alone. Few samples fall into the
         gap between two of them, and none from one side of it to the other.
         """
-        road, kind, obstacles = situation.road, self.kind, situation.obstacles
-        spacing, count = road.spacing, road.curvature.shape[0]
+        road, spacing = situation.road, situation.road.spacing
         (longest, middle), splice = _lengths(road), spacing * SPLICE
-        centres = obstacles.position[:, 0].T
-        away = jnp.linalg.norm(centres[..., None] - road.position[:, None], axis=0)
-        nearest = jnp.argmin(away, axis=1)
-        x, y = centres - road.position[:, nearest]
-        cos, sin = road.direction[:, nearest]
-        size = obstacles.radius + jnp.linalg.norm(obstacles.half, axis=1)
-        # From where on the car is beside it, and how far aside its middle has to be.
-        begin = spacing * nearest - size - kind.half[0]
-        room = size + kind.half[1] + kind.margin + self.comfort
-        ahead = obstacles.present & (begin > spacing * situation.place)
+        known, ahead = self._ahead(situation)
         # Instead of one that is not there: the middle of the road at the horizon.
-        none = jnp.asarray([spacing * count, 0.0, 0.0])[:, None]
-        known = jnp.stack([begin, cos * y - sin * x, room])
+        none = jnp.asarray([spacing * road.curvature.shape[0], 0.0, 0.0])[:, None]
         known = jnp.append(jnp.where(ahead, known, none), jnp.tile(none, 2), axis=1)
         (first, second), aside, room = known[:, jnp.argsort(known[0])[:2]]
         to_both = first - splice - middle, second - first - middle
@@ -251,6 +242,45 @@ class Manoeuvres:
         ways += [row(0.0, two, v, False) for two, v in product(sides, speeds)]
         return jnp.stack(ways)
 
+    def _ahead(
+        self, situation: Situation
+    ) -> tuple[Float[Array, "3 obstacle"], Bool[Array, " obstacle"]]:
+        """Which obstacles are ahead; what they take of the road, when the car is there.
+
+        From where on the car is beside each, its distance to the left of the road, and
+        how far aside from that the middle of the car has to be [m].
+        """
+        road, kind, obstacles = situation.road, self.kind, situation.obstacles
+        samples = jnp.arange(road.curvature.shape[0])
+        away = road.spacing * jnp.maximum(samples - situation.place, 0.0)
+        speed = jnp.sqrt(situation.committed.square[BEHIND])
+        steps = away / jnp.maximum(speed, kind.speed[0]) / self.dt
+        nearest, aside = beside(obstacles, road.position, road.direction, steps)
+        size = obstacles.radius + jnp.linalg.norm(obstacles.half, axis=1)
+        begin = road.spacing * nearest - size - kind.half[0]
+        room = size + kind.half[1] + kind.margin + self.comfort
+        ahead = obstacles.present & (begin > road.spacing * situation.place)
+        return jnp.stack([begin, aside, room]), ahead
+
+    def _turning(self, situation: Situation, block: Int[Array, ""]) -> Scalar:
+        """How far before what blocks a sample it can be passed from standstill [m].
+
+        Inf if it fills the lane: then no distance helps.
+        """
+        road, kind, signs = situation.road, self.kind, jnp.asarray([1.0, -1.0])
+        (begin, aside, room), ahead = self._ahead(situation)
+        away = jnp.where(ahead, jnp.abs(begin - road.spacing * block), jnp.inf)
+        which = jnp.argmin(away)
+        sides = aside[which] + signs * room[which]
+        edges = jnp.stack([road.left[block], road.right[block]])
+        # What the sides lack of comfort does not keep it from passing.
+        lacks = signs * sides + kind.half[1] + kind.margin - edges - self.comfort
+        passes = (lacks <= 0.0) & jnp.isfinite(away[which])
+        shift = jnp.abs(sides - situation.committed.move[0, block])
+        shift = jnp.min(jnp.where(passes, shift, jnp.inf))
+        bends, turns = BEND / kind.curvature * shift, 60.0 / kind.turning * shift
+        return road.spacing * SPLICE + jnp.maximum(jnp.sqrt(bends), jnp.cbrt(turns))
+
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
         before, spacing = situation.committed, situation.road.spacing
@@ -261,8 +291,13 @@ class Manoeuvres:
         grip = jnp.sqrt(jnp.maximum((ALMOST * situation.grip) ** 2 - bend**2, 0.01))
         grip = jnp.minimum(grip, self.kind.braking)
         gentle = jnp.minimum(self.kind.deceleration, grip)
-        until = jnp.argmax(judged.blocked) * spacing - self.standoff
-        left = jnp.maximum(until - situation.place * spacing, 1e-3)
+        block, here = jnp.argmax(judged.blocked), situation.place * spacing
+        turning = self._turning(situation, block)
+        nearest = block * spacing - self.standoff
+        # Where there is time it stands so far away that it can still turn.
+        until = jnp.maximum(block * spacing - turning, here + 0.5 * start / gentle)
+        until = jnp.where(jnp.isfinite(turning), jnp.minimum(until, nearest), nearest)
+        left = jnp.maximum(until - here, 1e-3)
         needed = jnp.clip(0.5 * start / left, gentle, grip)
         most = 2.0 * needed * jnp.maximum(until - samples * spacing, 0.0)
         most = jnp.minimum(before.square, most)
@@ -299,10 +334,7 @@ class Manoeuvres:
     def _evasion(
         self, situation: Situation, end: Scalar, longer: Scalar, braking: Scalar
     ) -> Committed:
-        """A lateral move with the grip, to an offset, and braking with what it leaves.
-
-        Of a quintic from rest to rest the largest d'' is 5.77 |Δd| / ℓ².
-        """
+        """A lateral move with the grip to an offset, braking with what it leaves."""
         road, before, kind = situation.road, situation.committed, self.kind
         start, count = before.square[BEHIND], before.square.shape[0]
         grip = kind.evasive * situation.grip
@@ -310,7 +342,7 @@ class Manoeuvres:
         # At low speed it ends where the class does.
         most = jnp.minimum(pull / jnp.maximum(start, 0.01), kind.curvature)
         aside = jnp.abs(end - before.move[0, SPLICE])
-        length = jnp.maximum(longer * jnp.sqrt(5.77 * aside / most), 5.0)
+        length = jnp.maximum(longer * jnp.sqrt(BEND * aside / most), 5.0)
         ahead = road.spacing * jnp.arange(count - SPLICE)
         moved = quintic(before.move[:, SPLICE], end, length, ahead)[:3]
         move = jnp.concatenate([before.move[:, :SPLICE], moved], axis=1)
@@ -364,14 +396,16 @@ class Manoeuvres:
         samples = jnp.arange(along.times.shape[0])
         now = jnp.interp(situation.place, samples, along.times)
         steps = jnp.maximum(along.times - now, 0.0) / self.dt
-        pose = along.position, steps, along.direction, half
+        pose = along.position, along.direction, half
 
-        # One after the other: all samples of all plans are then one long loop.
-        def nearer(before: Array, one: Obstacles) -> tuple[Array, None]:
-            return jnp.minimum(before, distance(one, *pose)), None
+        # One after the other: all samples of all plans are then one long loop, in
+        # which nothing is looked up.
+        def nearer(before: Array, one: Any) -> tuple[Array, None]:
+            return jnp.minimum(before, distance(*one, *pose)), None
 
+        places = jax.vmap(lambda one: place_at(one, steps))(situation.obstacles)
         gap = jnp.full(samples.shape, jnp.inf)
-        gap, _ = jax.lax.scan(nearer, gap, situation.obstacles)
+        gap, _ = jax.lax.scan(nearer, gap, (situation.obstacles, places))
         edge = jnp.minimum(road.left - move[0], road.right + move[0])
         edge = edge - half[1] - half[0] * jnp.abs(move[1]) / along.stretch
         # The car is between two samples, and both count, also where it stands.
