@@ -284,6 +284,16 @@ def lane():
     return table(head, lines)
 
 
+def lane_time():
+    """Milliseconds of a control step in a lane."""
+    rows = [row for row in read("benchmarks/lane.json") if "step_ms" in row]
+    cells = [
+        [f"{row['car']}, {row['row']}", row["search_ms"], row["step_ms"]]
+        for row in rows
+    ]
+    return table(["[ms]", "search", "whole step"], cells)
+
+
 BLOCKS = {
     "README.md": {"corridor": corridor},
     "docs/corridor.md": {
@@ -291,7 +301,7 @@ BLOCKS = {
         "shield": shield,
         "recovery": recovery,
     },
-    "docs/lane.md": {"wide": wide, "lane": lane},
+    "docs/lane.md": {"wide": wide, "lane": lane, "lane_time": lane_time},
     "docs/planner.md": {"timing": timing},
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/results.md": results.TABLES | {"peers": peers},

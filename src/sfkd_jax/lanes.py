@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -178,3 +179,28 @@ def distance(
         outside_box(*turned, theirs),
     )
     return jnp.where(obstacle.present, nearest - obstacle.radius, jnp.inf)
+
+
+def finite(
+    lane: Lane, obstacles: Obstacles
+) -> tuple[tuple[Lane, Obstacles], Bool[Array, ""]]:
+    """Return a finite scene, and whether it was one; padding may hold anything."""
+    points, count = lane.path.points.shape[0], obstacles.position.shape[0]
+    sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
+    rows = {leaf.shape[0] for leaf in obstacles}
+    if sizes != {(points,)} or rows != {count} or obstacles.position.ndim != 3:
+        raise ValueError(
+            f"left, right and speed of a lane have the shape ({points},) of its path, "
+            f"got {sizes}; obstacles (obstacle, …), their position (obstacle, step, "
+            f"2), got {[leaf.shape for leaf in obstacles]}"
+        )
+
+    def shown(leaf: Array) -> Array:
+        present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(present, leaf, jnp.zeros_like(leaf))
+
+    scene = lane, Obstacles(*map(shown, obstacles))
+    leaves = jax.tree.leaves(scene)
+    clean = jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+    whole = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)
+    return jax.tree.map(whole, scene), clean

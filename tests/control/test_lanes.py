@@ -219,19 +219,17 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, pl
 @pytest.mark.parametrize("wall", ["one", "many"])
 def test_where_nothing_is_admissible_it_stops_and_goes_on_later(lane, road, wall):
     """In front of what nothing can pass; far enough to turn from what one could."""
-    many = np.array([[70.0, d] for d in np.arange(-6.0, 6.1, 1.5)])
-    wall, goes = (
-        circles(beside(road, many), 0.8),
-        many[:, 1] <= (9.0 if wall == "one" else 0.0),
-    )
-    one, wall = wall == "one", circles(beside(road, many), 0.8)
+    places = np.array([[70.0, d] for d in np.arange(-6.0, 6.1, 1.5)])
+    one, wall = wall == "one", circles(beside(road, places), 0.8)
+    goes = places[:, 1] <= (9.0 if one else 0.0)
     if one:
         boxes = jnp.tile(jnp.asarray([0.8, 6.0]), (9, 1))
-        wall = wall._replace(half=boxes, radius=jnp.zeros(9))
+        middle = jnp.arange(9) == 4
+        wall = wall._replace(half=boxes, radius=jnp.zeros(9), present=middle)
     stood = []
 
     def seen(number, car):
-        return wall._replace(present=jnp.asarray((number < 150) | ~goes))
+        return wall._replace(present=wall.present & ((number < 150) | ~goes))
 
     rows = drive(lane, road, seen, 200, friction=0.6)
     for number, (car, _, info) in enumerate(rows[:150]):
@@ -239,7 +237,7 @@ def test_where_nothing_is_admissible_it_stops_and_goes_on_later(lane, road, wall
         assert bool(info["stopping"]) or number == 0
         stood.append(car[3])
     assert stood[-1] == 0.0
-    near, far = (0.7, 2.5) if one else (20.0, 50.0)
+    near, far = (0.7, 2.5) if one else (12.0, 40.0)
     assert near < room(rows[149][0], wall) < far
     assert np.diff(stood).min() > -0.7 * 9.81 * 0.6 * DT - 0.05
     assert rows[-1][0][3] > 1.5

@@ -20,7 +20,7 @@ from sfkd_jax.control.lanes._reference import (
     window,
 )
 from sfkd_jax.control.planners._planner import all_finite
-from sfkd_jax.lanes import Lane, Obstacles
+from sfkd_jax.lanes import Lane, Obstacles, finite
 from sfkd_jax.paths import Lap, point_at, project
 from sfkd_jax.ranges import (
     AtLeastOne,
@@ -43,8 +43,6 @@ from sfkd_jax.types import (
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
 GRAVITY = 9.81
-TOLERANCE = 0.02
-"""Of limits of the class, relative: what is committed is judged at every step."""
 LOST = 10.0
 """Distance from where the car should be, at which it is somewhere else [m]."""
 
@@ -59,8 +57,7 @@ class LaneState(NamedTuple):
         progress: of the car along the path of the lane [m].
         wait: number of steps until the next search.
         started: whether there is a reference.
-        evading: whether it is one outside the class.
-        doubt: number of steps until a corridor may be claimed again.
+        doubt: number of steps until a corridor may be claimed; largest in an evasion.
     """
 
     inner: Any
@@ -69,7 +66,6 @@ class LaneState(NamedTuple):
     progress: Scalar
     wait: Int[Array, ""]
     started: Bool[Array, ""]
-    evading: Bool[Array, ""]
     doubt: Int[Array, ""]
 
 
@@ -136,7 +132,6 @@ class InLane:
             progress=jnp.zeros(()),
             wait=jnp.zeros((), jnp.int32),
             started=jnp.asarray(False),
-            evading=jnp.asarray(False),
             doubt=jnp.zeros((), jnp.int32),
         )
 
@@ -150,7 +145,7 @@ class InLane:
     ) -> tuple[Control, LaneState, ControllerInfo]:
         """Take one control step."""
         task, weights = self.manoeuvres, state.planner.tuning.cost
-        scene, clean = _finite(*scene)
+        scene, clean = finite(*scene)
         progress, situation = self._situation(state, observation, env, scene, clean)
         path = scene[0].path
         kept = task.judge(weights, situation, situation.committed)
@@ -163,8 +158,8 @@ class InLane:
             lambda: (state.planner, situation.committed, jnp.asarray(False)),
         )
         judged = task.judge(weights, situation, committed)
-        # What was admissible stays so; rounding aside, a last resort need not be.
-        left = jnp.where(free, state.evading, judged.outside > TOLERANCE)
+        # What was admissible stays so; a last resort need not be.
+        left = jnp.where(free, state.doubt == self.trial, judged.outside > 0.0)
         evading = left & ~taken
         doubt = jnp.where(evading, self.trial, jnp.maximum(state.doubt - 1, 0))
         times = task.dt * jnp.arange(1, self.horizon + 1)
@@ -190,9 +185,7 @@ class InLane:
         }
         wait = jnp.where(due, self.period, state.wait) - 1
         started = state.started | all_finite(observation)
-        after = LaneState(
-            inner, planner, committed, progress, wait, started, evading, doubt
-        )
+        after = LaneState(inner, planner, committed, progress, wait, started, doubt)
         return control, after, report
 
     def _situation(
@@ -265,27 +258,6 @@ class InLane:
         )
         committed = jax.tree.map(partial(jnp.where, taken), found, otherwise)
         return after, committed, taken
-
-
-def _finite(lane: Lane, obstacles: Obstacles) -> tuple[Scene, Bool[Array, ""]]:
-    """Return a finite scene, and whether it was one; padding may hold anything."""
-    points, count = lane.path.points.shape[0], obstacles.position.shape[0]
-    sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
-    rows = {leaf.shape[0] for leaf in obstacles}
-    if sizes != {(points,)} or rows != {count} or obstacles.position.ndim != 3:
-        raise ValueError(
-            f"left, right and speed of a lane have the shape ({points},) of its path, "
-            f"got {sizes}; obstacles are (obstacle, …), their position (obstacle, "
-            f"step, 2), got {[leaf.shape for leaf in obstacles]}"
-        )
-
-    def shown(leaf: Array) -> Array:
-        present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(present, leaf, jnp.zeros_like(leaf))
-
-    scene = lane, Obstacles(*map(shown, obstacles))
-    whole = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)
-    return jax.tree.map(whole, scene), all_finite(scene)
 
 
 in_lane = factory(InLane, InLane.controller)

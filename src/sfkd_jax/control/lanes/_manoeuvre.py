@@ -34,9 +34,11 @@ ALMOST = 0.95
 """Share of the grip of a stop that cannot be gentler."""
 BEND = 5.77
 """Largest second derivative of a quintic between rests, by its height and length²."""
-ENDS, LENGTHS, BRAKING = 11, (0.7, 0.85, 1.0, 1.25), (0.0, 0.4, 0.8)
-"""Of evasions: how many offsets they end at; lengths, relative to the one that takes
-all of the grip; shares of what it then leaves for the brakes.
+EVASIVE, TRACKED = 0.85, 3.0
+"""Share of the grip of an evasion; largest v² κ that a law can still follow [m/s²]."""
+ENDS, LENGTHS, BRAKING = range(-5, 6), (0.7, 0.85, 1.0, 1.25), (0.0, 0.4, 0.8)
+"""Of evasions: where they end, in fifths of the free lane; lengths, relative to the one
+that takes all of the grip; shares of what it leaves for the brakes.
 """
 LATE = 0.03
 """Distances are those at samples; in between an obstacle may be nearer by less [m]."""
@@ -60,8 +62,6 @@ class Class:
         deceleration: largest in a planned change of speed [m/s²].
         braking: largest of a stop that cannot be gentler [m/s²].
         share: of the grip that is planned with.
-        evasive: share of the grip of an evasion, which leaves the class.
-        tracked: largest v² κ of one, which the law can still follow [m/s²].
     """
 
     curvature: Positive
@@ -77,8 +77,6 @@ class Class:
     deceleration: Positive = 1.0
     braking: Positive = 6.0
     share: Fraction = 0.7
-    evasive: Fraction = 0.85
-    tracked: Positive = 3.0
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -129,11 +127,6 @@ class Judged(NamedTuple):
     strain: Scalar
 
     @property
-    def room(self) -> Scalar:
-        """What obstacles and edges leave at least [m]."""
-        return jnp.min(jnp.minimum(self.gap, self.edge))
-
-    @property
     def blocked(self) -> Bool[Array, " sample"]:
         """Where it comes too near to something; NaN does."""
         return ~(jnp.minimum(self.gap, self.edge) >= 0.0)
@@ -141,7 +134,8 @@ class Judged(NamedTuple):
     @property
     def violation(self) -> Scalar:
         """How far it is from being admissible, 0 if it is."""
-        return jnp.maximum(jnp.maximum(self.outside, -self.room), 0.0)
+        room = jnp.min(jnp.minimum(self.gap, self.edge))
+        return jnp.maximum(jnp.maximum(self.outside, -room), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,27 +253,27 @@ class Manoeuvres:
         size = obstacles.radius + jnp.linalg.norm(obstacles.half, axis=1)
         begin = road.spacing * nearest - size - kind.half[0]
         room = size + kind.half[1] + kind.margin + self.comfort
-        ahead = obstacles.present & (begin > road.spacing * situation.place)
-        return jnp.stack([begin, aside, room]), ahead
+        ahead = begin > road.spacing * situation.place
+        return jnp.stack([begin, aside, room]), ahead & obstacles.present
 
     def _turning(self, situation: Situation, block: Int[Array, ""]) -> Scalar:
-        """How far before what blocks a sample it can be passed from standstill [m].
+        """How far before what blocks a sample a car stands that can still pass it [m].
 
-        Inf if it fills the lane: then no distance helps.
+        `standoff` if that fills the lane.
         """
         road, kind, signs = situation.road, self.kind, jnp.asarray([1.0, -1.0])
         (begin, aside, room), ahead = self._ahead(situation)
-        away = jnp.where(ahead, jnp.abs(begin - road.spacing * block), jnp.inf)
-        which = jnp.argmin(away)
+        away = jnp.abs(begin - road.spacing * block)
+        which = jnp.argmin(jnp.where(ahead, away, jnp.inf))
         sides = aside[which] + signs * room[which]
-        edges = jnp.stack([road.left[block], road.right[block]])
         # What the sides lack of comfort does not keep it from passing.
-        lacks = signs * sides + kind.half[1] + kind.margin - edges - self.comfort
-        passes = (lacks <= 0.0) & jnp.isfinite(away[which])
+        lacks = signs * sides + kind.half[1] + kind.margin - self.comfort
+        lacks -= jnp.stack([road.left[block], road.right[block]])
         shift = jnp.abs(sides - situation.committed.move[0, block])
-        shift = jnp.min(jnp.where(passes, shift, jnp.inf))
         bends, turns = BEND / kind.curvature * shift, 60.0 / kind.turning * shift
-        return road.spacing * SPLICE + jnp.maximum(jnp.sqrt(bends), jnp.cbrt(turns))
+        length = jnp.maximum(jnp.sqrt(bends), jnp.cbrt(turns)) + road.spacing * SPLICE
+        length = jnp.min(jnp.where(lacks <= 0.0, length, jnp.inf))
+        return jnp.where(jnp.isfinite(length), length, self.standoff)
 
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
@@ -292,11 +286,12 @@ class Manoeuvres:
         grip = jnp.minimum(grip, self.kind.braking)
         gentle = jnp.minimum(self.kind.deceleration, grip)
         block, here = jnp.argmax(judged.blocked), situation.place * spacing
-        turning = self._turning(situation, block)
-        nearest = block * spacing - self.standoff
         # Where there is time it stands so far away that it can still turn.
-        until = jnp.maximum(block * spacing - turning, here + 0.5 * start / gentle)
-        until = jnp.where(jnp.isfinite(turning), jnp.minimum(until, nearest), nearest)
+        far = jnp.maximum(self._turning(situation, block), self.standoff)
+        until = jnp.minimum(
+            here + 0.5 * start / gentle, block * spacing - self.standoff
+        )
+        until = jnp.maximum(until, block * spacing - far)
         left = jnp.maximum(until - here, 1e-3)
         needed = jnp.clip(0.5 * start / left, gentle, grip)
         most = 2.0 * needed * jnp.maximum(until - samples * spacing, 0.0)
@@ -305,25 +300,19 @@ class Manoeuvres:
         square = jnp.where(samples < BEHIND, before.square, square)
         return before._replace(square=square)
 
-    def last_resort(
-        self, weights: Any, situation: Situation, kept: Judged
-    ) -> Committed:
-        """Return what to do where nothing of the class is free.
+    def last_resort(self, weights: Any, situation: Situation, kept: Judged) -> Any:
+        """Return the `Committed` where nothing of the class is free.
 
         The stop, if that is free or nothing is clear of all in view. Else what stays
         farthest: stop, committed reference, or a lateral move, also braked.
         """
-        road, plans = situation.road, [self.stop(situation, kept), situation.committed]
-        room = self.kind.half[1] + self.kind.margin
-        left, right = road.left[SPLICE] - room, room - road.right[SPLICE]
-        ends = right + (left - right) * jnp.linspace(0.0, 1.0, ENDS)
-        rest = jnp.asarray([*product(LENGTHS, BRAKING)])
-        rows = [jnp.repeat(ends, len(rest)), *jnp.tile(rest.T, ENDS)]
-        moves = jax.vmap(partial(self._evasion, situation))(*rows)
+        rows = jnp.asarray([*product(ENDS, LENGTHS, BRAKING)])
+        moves = jax.vmap(partial(self._evasion, situation))(*rows.T)
+        plans = self.stop(situation, kept), situation.committed
         plans = jax.tree.map(lambda *one: jnp.stack(one), *plans)
         plans = jax.tree.map(lambda *some: jnp.concatenate(some), plans, moves)
         judged = jax.vmap(partial(self.judge, weights, situation))(plans)
-        room = jax.vmap(lambda one: one.room)(judged)
+        room = jnp.min(jnp.minimum(judged.gap, judged.edge), axis=1)
         beyond = 10.0 * jnp.maximum(judged.strain - 1.0, 0.0)
         worth = jnp.minimum(room, self.comfort) - beyond - 0.05 * judged.strain
         # What hits in any case brakes.
@@ -334,13 +323,15 @@ class Manoeuvres:
     def _evasion(
         self, situation: Situation, end: Scalar, longer: Scalar, braking: Scalar
     ) -> Committed:
-        """A lateral move with the grip to an offset, braking with what it leaves."""
+        """A lateral move with the grip, braking with what it leaves."""
         road, before, kind = situation.road, situation.committed, self.kind
         start, count = before.square[BEHIND], before.square.shape[0]
-        grip = kind.evasive * situation.grip
-        pull = jnp.minimum(grip, kind.tracked)
+        grip = EVASIVE * situation.grip
+        pull = jnp.minimum(grip, TRACKED)
         # At low speed it ends where the class does.
         most = jnp.minimum(pull / jnp.maximum(start, 0.01), kind.curvature)
+        edge = jnp.where(end > 0.0, road.left[SPLICE], road.right[SPLICE])
+        end = 0.2 * end * jnp.maximum(edge - kind.half[1] - kind.margin, 0.0)
         aside = jnp.abs(end - before.move[0, SPLICE])
         length = jnp.maximum(longer * jnp.sqrt(BEND * aside / most), 5.0)
         ahead = road.spacing * jnp.arange(count - SPLICE)
@@ -371,7 +362,7 @@ class Manoeuvres:
             ]
         )
         pull = jnp.hypot(square * curvature, change) / (ALMOST * situation.grip)
-        pull = jnp.maximum(pull, square * jnp.abs(curvature) / kind.tracked)
+        pull = jnp.maximum(pull, square * jnp.abs(curvature) / TRACKED)
         # What is before the splice cannot be changed any more.
         outside = jnp.max(jnp.where(along.reached, shares, 0.0)[:, SPLICE:]) - 1.0
         strain = jnp.max(jnp.where(along.reached, pull, 0.0)[SPLICE:])
