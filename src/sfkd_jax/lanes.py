@@ -136,16 +136,13 @@ def beside(
     direction: Float[Array, "2 point"],
     step: Float[Array, " point"],
 ) -> tuple[Int[Array, " obstacle"], Float[Array, " obstacle"]]:
-    """Return the point of a line that is nearest to each obstacle at that point's time.
+    """Return the points of a line that are nearest to obstacles, and how far left [m].
 
     Args:
         obstacles: (obstacle,).
         line: positions [m].
         direction: cosine and sine of its yaw.
-        step: number of steps from now at each point.
-
-    Returns:
-        Index of the point; distance of the obstacle to the left of it [m].
+        step: number of steps from now until each point is reached.
     """
     x, y = jax.vmap(lambda one: place_at(one, step))(obstacles)
     x, y = (place.reshape(len(place), -1) for place in (x, y))

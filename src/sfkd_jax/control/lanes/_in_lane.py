@@ -254,7 +254,7 @@ class InLane:
         otherwise = jax.lax.cond(
             taken | free,
             lambda: before,
-            lambda: task.last_resort(planner.tuning.cost, situation, kept),
+            lambda: task.resort(planner.tuning.cost, situation, kept),
         )
         committed = jax.tree.map(partial(jnp.where, taken), found, otherwise)
         return after, committed, taken

@@ -300,8 +300,8 @@ class Manoeuvres:
         square = jnp.where(samples < BEHIND, before.square, square)
         return before._replace(square=square)
 
-    def last_resort(self, weights: Any, situation: Situation, kept: Judged) -> Any:
-        """Return the `Committed` where nothing of the class is free.
+    def resort(self, weights: Any, situation: Situation, kept: Judged) -> Committed:
+        """Return the last resort, where nothing of the class is free.
 
         The stop, if that is free or nothing is clear of all in view. Else what stays
         farthest: stop, committed reference, or a lateral move, also braked.
@@ -392,7 +392,7 @@ class Manoeuvres:
         # One after the other: all samples of all plans are then one long loop, in
         # which nothing is looked up.
         def nearer(before: Array, one: Any) -> tuple[Array, None]:
-            return jnp.minimum(before, distance(*one, *pose)), None
+            return jnp.minimum(before, distance(one[0], one[1], *pose)), None
 
         places = jax.vmap(lambda one: place_at(one, steps))(situation.obstacles)
         gap = jnp.full(samples.shape, jnp.inf)
