@@ -274,6 +274,7 @@ class ControllerInfo(TypedDict, total=False):
     offset: Scalar  # of the reference from the centre line [m]
     admissible: Bool[Array, ""]  # the committed reference is in its class, and free
     stopping: Bool[Array, ""]  # it ends at rest
+    evading: Bool[Array, ""]  # it is outside the class
     # a course with obstacles
     clearance: Scalar  # claimed distance from obstacles [m]; NaN where none is
     gap: Scalar  # their true distance, as a simulation knows it [m]

@@ -158,9 +158,9 @@ class InLane:
             lambda: (state.planner, situation.committed, jnp.asarray(False)),
         )
         judged = task.judge(weights, situation, committed)
-        # What was admissible stays so; a last resort need not be.
-        left = jnp.where(free, state.doubt == self.trial, judged.outside > 0.0)
-        evading = left & ~taken
+        # What was admissible stays so; a last resort need not be, until it stands.
+        resorted = (~free | (state.doubt == self.trial)) & ~taken
+        evading = resorted & (judged.outside > 0.0)
         doubt = jnp.where(evading, self.trial, jnp.maximum(state.doubt - 1, 0))
         times = task.dt * jnp.arange(1, self.horizon + 1)
         at = partial(window, path, committed, judged.curve, situation.place)
