@@ -28,6 +28,7 @@ CERTIFICATE = "certificate.json"
 
 
 UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
+FRICTION_AND_WIND = ["friction [-]", "lateral wind [m/s]"]
 UNITS |= {"yaw": "[rad]", "yaw_rate": "[rad/s]", "steering": "[rad]"}
 """Of the states of the vehicles of this package."""
 
@@ -90,7 +91,7 @@ class Policy(TrainedModel):
             ],
             "observation": list(plant.state_names),
             "environment": {
-                "names": columns or ["friction [-]", "lateral wind [m/s]"],
+                "names": columns or box.get("names") or FRICTION_AND_WIND,
                 "low": list(box["low"]),
                 "high": list(box["high"]),
             },

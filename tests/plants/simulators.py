@@ -82,6 +82,7 @@ def highway():
 
     class Highway:
         state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
+        environment_names = ("grip [-]", "side force [kN]")
         dt, wheelbase = 0.1, Bicycle.LENGTH
         control_low, control_high = (-0.5, -6.0), (0.5, 3.0)
 

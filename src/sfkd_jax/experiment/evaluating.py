@@ -114,6 +114,9 @@ def load_systems(settings: Settings) -> dict[str, System]:
     references = build.reference_systems(plant, data.ensure_law(settings))
     systems = {}
     for name in settings.evaluation.systems:
+        if name == "oracle" and getattr(settings.vehicle, "env", None):
+            store.print_message("no oracle: it would plan with copies of the simulator")
+            continue
         if name == "self":
             systems[settings.model.system] = _policy_system(settings)
             continue
@@ -173,7 +176,7 @@ class SystemEvaluation:
             self.params,
             horizon=settings.controller.horizon,
             dt=plant.dt,
-            observation_noise=settings.evaluation.observation_noise,
+            observation_noise=settings.sensors(plant.state_names),
         )
         self._simulate = _over_episodes(simulate)
 

@@ -30,11 +30,14 @@ from sfkd_jax.ranges import (
     Interval,
     MayBeEmpty,
     Names,
+    NonNegative,
     NonNegativeInt,
     Numbers,
 )
 from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
 
+SENSORS = {"p_x": 0.015, "p_y": 0.015, "yaw": 0.002, "v": 0.03, "v_y": 0.02}
+SENSORS |= {"yaw_rate": 0.002, "steering": 0.001}
 Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
@@ -49,6 +52,7 @@ class EnvironmentSettings:
     Attributes:
         low: lower corner of the box E; None for that of recorded logs.
         high: upper corner of E.
+        names: of the entries of e, with units; () for friction and lateral wind.
         source: "measured", "estimated" while driving, or "none": e is not observed.
         sensor: delay, noise and bias of a measured e.
     """
@@ -56,6 +60,7 @@ class EnvironmentSettings:
     sensor: Any
     low: Bounds | None = None
     high: Bounds | None = None
+    names: Names = ()
     source: Annotated[str, OneOf(build.ENV_SOURCES)] = "measured"
 
     @property
@@ -163,9 +168,8 @@ class EvaluationSettings:
         episode_s: [s].
         seed: of roads, sensors and samplers.
         systems: "self" and reference systems; none: `train` trains alone.
-        observation_noise: standard deviations of p_x, p_y [m], yaw [rad], v, v_y [m/s],
-            yaw rate [rad/s], steering [rad]; by default of a satellite and inertial
-            unit of survey grade.
+        observation_noise: standard deviations by name of the state; by default of a
+            satellite and inertial unit of survey grade. Other states are exact.
         side_forces: side forces that no model knows [N].
     """
 
@@ -173,7 +177,7 @@ class EvaluationSettings:
     episode_s: Seconds = 60.0
     seed: NonNegativeInt = 2026
     systems: Names = ("self", "nominal", "oracle")
-    observation_noise: Numbers = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+    observation_noise: dict[str, NonNegative] = field(default_factory=SENSORS.copy)
     side_forces: Numbers = ()
 
 
@@ -257,6 +261,16 @@ class Settings:
         """The certificate of the run, whether or not it exists."""
         return self.run_dir / CERTIFICATE
 
+    def sensors(self, names: tuple[str, ...]) -> tuple[float, ...]:
+        """Return the noise of the sensors of these states."""
+        noise = self.evaluation.observation_noise
+        if unknown := set(noise) - {*names, *SENSORS}:
+            raise ValueError(
+                f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
+                f"the states of the vehicle are {', '.join(names)}"
+            )
+        return tuple(noise.get(name, 0.0) for name in names)
+
     @property
     def logs(self) -> LogSettings | None:
         """The settings of logs; None if the data are simulated."""
@@ -289,8 +303,17 @@ def parse_settings(values: Values) -> Settings:
     root, vehicle = str(Path(settings.root).expanduser()), settings.vehicle
     # Recorded with the run: whoever loads its policy need not have the simulator.
     if name := getattr(vehicle, "env", None):
-        vehicle = replace(vehicle, **described(name))
-    return replace(settings, model=model, root=root, vehicle=vehicle)
+        known, names = described(name)
+        vehicle = replace(vehicle, **known)
+        environment = replace(environment, names=environment.names or names)
+    names, low = environment.names, environment.low or environment.names
+    if names and len(names) != len(low):
+        raise ValueError(
+            f"environment.low and environment.high need {len(names)} entries, "
+            f"for {', '.join(names)}"
+        )
+    about: dict[str, Any] = {"vehicle": vehicle, "environment": environment}
+    return replace(settings, model=model, root=root, **about)
 
 
 def register() -> None:

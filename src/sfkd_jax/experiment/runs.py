@@ -69,6 +69,8 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
         "controller": plain(settings.controller),
         "experiment": settings.name,
     }
+    if settings.environment.names:
+        recorded["environment"]["names"] = list(settings.environment.names)
     if settings.logs:
         # Of logs E is measured, and whoever loads the policy has no logs.
         box = {"low": dataset.env_low.tolist(), "high": dataset.env_high.tolist()}

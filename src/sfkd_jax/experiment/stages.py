@@ -131,6 +131,11 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     model = build.build_model(
         settings.model, space, build.build_vehicle(settings.vehicle)
     )
+    names = settings.environment.names or policy.FRICTION_AND_WIND
+    if settings.environment.is_known and not settings.logs:
+        box = zip(names, dataset.env_low, dataset.env_high, strict=False)
+        ranges = (f"{name} from {low:g} to {high:g}" for name, low, high in box)
+        store.print_message(f"the model reads e: {', '.join(ranges)}")
     loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
     key, best = jax.random.fold_in(jax.random.key(settings.seed), 0), None
     if model.fitting.identify is not None:
@@ -285,12 +290,13 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
     )
     # Logs have no plant to drive: a corridor needs runs under known conditions.
     if document["outputs"] and settings.logs is None:
+        plant = build.build_vehicle(settings.vehicle)
         loop = closed_loop(
-            build.build_vehicle(settings.vehicle),
+            plant,
             trained.model,
             trained.params,
             trained.law,
-            settings.evaluation.observation_noise,
+            settings.sensors(plant.state_names),
         )
         document["corridor"] = certify_corridor(
             loop,

@@ -97,7 +97,8 @@ def simulator(make: Make) -> Vehicle:
     begins with the state. Where it has them, `control_low`, `control_high`,
     `wheelbase`, `speed_loop` and `wind_force` are the settings of `own`, `workers` is
     the number of its copies, each in a process of its own (by default one a core), and
-    `timeout_s` the longest time for its share of a batch.
+    `timeout_s` the longest time for its share of a batch, and `environment_names` what
+    the entries of e are, with units.
 
     The step works under `jit`, `vmap` and `scan`, a batch at a time, without a
     gradient. If the simulator fails, the state is NaN, and a warning says why.
@@ -105,12 +106,14 @@ def simulator(make: Make) -> Vehicle:
     Args:
         make: package.module:function, or a function that can be pickled.
     """
-    return own(**described(make), step=on_host(make))
+    return own(**described(make)[0], step=on_host(make))
 
 
-def described(make: Make) -> dict[str, Any]:
-    """Return the settings of `own` that a simulator knows, or refuse it."""
-    return pool_of(make).about
+def described(make: Make) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return settings of `own` and names of e that a simulator knows, or refuse it."""
+    about = dict(pool_of(make).about)
+    names = about.pop("environment_names")
+    return about, names
 
 
 def on_host(make: Make) -> Step:

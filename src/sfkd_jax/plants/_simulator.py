@@ -175,7 +175,9 @@ def _about(simulator: Any) -> dict[str, Any]:
             kind = {"workers": int, "speed_loop": bool}.get(name, float)
             plain = np.asarray(value, kind).tolist()
             about[name] = tuple(plain) if isinstance(plain, list) else plain
-    return about | {"state_names": tuple(map(str, simulator.state_names))}
+    names = {"environment_names": getattr(simulator, "environment_names", ())}
+    names |= {"state_names": simulator.state_names}
+    return about | {name: tuple(map(str, each)) for name, each in names.items()}
 
 
 def _serve(channel: Connection) -> None:
