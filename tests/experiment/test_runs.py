@@ -89,6 +89,13 @@ def test_every_path_model_builds_with_its_planner(name):
     check(*PATH_MODELS[name])
 
 
+def test_a_law_alone_is_a_system_along_a_path_only():
+    alone = "evaluation.systems=[law,law_nominal,law_plant]"
+    check(alone)
+    with pytest.raises(ValueError, match="systems entry 'law'"):
+        check(alone, "dataset=standard", "model=sfkd", "controller=mppi")
+
+
 def test_path_coordinates_for_data_and_model_or_for_neither():
     for overrides in (("dataset=standard",), ("model=sfkd", "controller=mppi")):
         with pytest.raises(ValueError, match="go together"):

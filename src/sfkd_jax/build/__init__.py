@@ -46,6 +46,9 @@ PLANTS = {
 }
 MODELS = models.FACTORIES | {"own": models.own}
 """Models of settings: those of the package, and one from outside by name."""
+LAW_MODELS = ("learned", "nominal", "plant")
+LAWS_ALONE = {f"law_{model}": model for model in LAW_MODELS}
+"""System of an evaluation -> whose law drives alone in it."""
 Directory = Annotated[str, BelowRoot()]
 
 
@@ -281,7 +284,7 @@ class LawSettings:
             "nominal", the textbook bicycle, which knows no e, or "plant", the truth.
     """
 
-    model: Annotated[str, OneOf(("learned", "nominal", "plant"))] = "plant"
+    model: Annotated[str, OneOf(LAW_MODELS)] = "plant"
 
 
 def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:

@@ -120,7 +120,7 @@ def load_systems(settings: Settings) -> dict[str, System]:
         if name == "self":
             systems[settings.model.system] = _policy_system(settings)
             continue
-        if settings.along_path and (whose := name.removeprefix("law_")) != name:
+        if settings.along_path and (whose := build.LAWS_ALONE.get(name)):
             law = data.ensure_law(data.with_law_of(settings, whose))
             references[name] = build.reference_systems(plant, law)["law"]
         system = choose(references, name, "evaluation.systems entry")

@@ -56,6 +56,7 @@ def check_settings(settings: Settings) -> None:
     sizes = _sizes(settings, plant)
     law = _zero_law(sizes) if settings.along_path else None
     systems = {"self": None} | build.reference_systems(plant, law)
+    systems |= dict.fromkeys(build.LAWS_ALONE) if law else {}
     for name in settings.evaluation.systems:
         choose(systems, name, "evaluation.systems entry")
     scales = (part(n) for n in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
