@@ -60,6 +60,7 @@ DATA = BOX | {
     "peak_curvature": 0.05,
     "wavelengths": (50.0, 200.0),
     "lateral_acceleration": 2.0,
+    "law": {"model": "learned"},
     "acceleration": 2.0,
     "lateral_jerk": 7.0,
     "curvature_slope": 0.02,

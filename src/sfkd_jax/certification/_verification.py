@@ -39,7 +39,7 @@ from sfkd_jax.certification._weights import (
     require,
     well_formed,
 )
-from sfkd_jax.certification.corridor import EXCITATION, LENGTH, drive_class, law_model
+from sfkd_jax.certification.corridor import EXCITATION, LENGTH, drive_class
 from sfkd_jax.control import WINDOWS
 from sfkd_jax.data import SCENARIOS, sizes_of_parts
 from sfkd_jax.scenarios import DRIVES
@@ -397,7 +397,7 @@ def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
     largest = [position, position, yaw, *[REACH] * sensors][:sensors]
     data = settings["dataset"]
     given = drive_class(data) | {name: data[name] for name in EXCITATION}
-    given |= law_model(data)
+    given["law_model"] = data["law"]["model"]
     dwell, dt = stated["dwell_s"], settings["vehicle"]["dt"]
     return {
         **{name: Follows(value) for name, value in given.items()},

@@ -169,7 +169,7 @@ def certify_corridor(
         "duration_s": duration,
         "sensor_noise": loop.noise,
         "perturbation": loop.law.perturbation.tolist(),
-        **law_model(data),
+        "law_model": data["law"]["model"],
     }
     # The shortest dwell: an attack switches as often as the conditions allow.
     held = max(1, round(dwell[0] / dt))
@@ -203,15 +203,6 @@ def certify_corridor(
 def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a data set that say which drives a corridor is about."""
     return {name: data[name] for name in ROAD_SETTINGS}
-
-
-def law_model(data: Mapping[str, Any]) -> dict[str, str]:
-    """Return from whose steps the law of a data set was derived, as a condition.
-
-    Laws of older versions are those of the plant, and do not say so.
-    """
-    law = data.get("law", {})
-    return {"law_model": law["model"]} if "model" in law else {}
 
 
 def _worst_group(
