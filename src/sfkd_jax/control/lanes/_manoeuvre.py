@@ -261,19 +261,20 @@ class Manoeuvres:
 
         `standoff` if that fills the lane.
         """
-        road, kind, signs = situation.road, self.kind, jnp.asarray([1.0, -1.0])
+        road, kind, signs = situation.road, self.kind, jnp.asarray([[1.0], [-1.0]])
         (begin, aside, room), ahead = self._ahead(situation)
-        away = jnp.abs(begin - road.spacing * block)
-        which = jnp.argmin(jnp.where(ahead, away, jnp.inf))
-        sides = aside[which] + signs * room[which]
+        sides = aside + signs * room
         # What the sides lack of comfort does not keep it from passing.
         lacks = signs * sides + kind.half[1] + kind.margin - self.comfort
-        lacks -= jnp.stack([road.left[block], road.right[block]])
+        lacks -= jnp.stack([road.left[block], road.right[block]])[:, None]
         shift = jnp.abs(sides - situation.committed.move[0, block])
         bends, turns = BEND / kind.curvature * shift, 60.0 / kind.turning * shift
         length = jnp.maximum(jnp.sqrt(bends), jnp.cbrt(turns)) + road.spacing * SPLICE
-        length = jnp.min(jnp.where(lacks <= 0.0, length, jnp.inf))
-        return jnp.where(jnp.isfinite(length), length, self.standoff)
+        length = jnp.min(jnp.where(lacks <= 0.0, length, jnp.inf), axis=0)
+        # All that stand there together, within 4 m, may block it, and any may leave.
+        there = ahead & (jnp.abs(begin - road.spacing * block) < 4.0)
+        length = jnp.where(there & jnp.isfinite(length), length, self.standoff)
+        return jnp.max(length)
 
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
