@@ -248,11 +248,7 @@ def vehicle_state(coordinates: PathState) -> State:
 def path_step(
     step: Step,
 ) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
-    """Return (ξ, u, κ, e) -> ξ one period later, exact on a circle of curvature κ.
-
-    Args:
-        step: of the vehicle, in the world frame.
-    """
+    """Return (ξ, u, κ, e) -> ξ one period later, exact on a circle of curvature κ."""
 
     def along(
         coordinates: PathState, control: Control, curvature: Scalar, env: Environment

@@ -40,13 +40,6 @@ def fold(model: Model, params: Params) -> Params:
 
     `policy.load` does this; a program that controls with parameters it has just trained
     calls it, and compiles it.
-
-    Args:
-        model: any model.
-        params: of the model; folded ones are returned unchanged.
-
-    Returns:
-        `Folded`, or the parameters themselves if the model has nothing to share.
     """
     # Folding twice would wrap the weights twice, and `unfold` removes one layer.
     if model.shared is None or isinstance(params, Folded):
@@ -81,9 +74,6 @@ def with_offset(model: Model) -> Model:
     Neither δ nor b depends on z, so two predictions differ as those of the model do:
     the weights that a certificate is about, its rate and its witness are the same. δ
     and b are data, so changing them compiles nothing.
-
-    Args:
-        model: any model; its own parameters stay as they are.
     """
 
     def step(fiber: Offset, latent: Latent, control: Control) -> Latent:
@@ -234,12 +224,6 @@ def defects(
         d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
 
     F is the latent step.
-
-    Args:
-        model: any model.
-        params: of the model.
-        trajectory: one, states (T + 1, state).
-        along: the result of `fibers_along`, if it is available.
     """
     fibers, later = along or fibers_along(model, params, trajectory)
     # One frame for all times, or latents in a frame could not be compared.

@@ -47,19 +47,13 @@ Observed: TypeAlias = tuple[Float[Array, "run gap chart"], Float[Array, "run gap
 
 
 class Loop(NamedTuple):
-    """The closed loop of plant and law, and the model of the policy.
+    """The closed loop of plant and law, and the model of the policy."""
 
-    Attributes:
-        plant: the true plant with the law around it.
-        law: of the policy, as are model and (folded) params.
-        noise: standard deviations of the sensors.
-    """
-
-    plant: Vehicle
-    law: PathLaw
+    plant: Vehicle  # the true plant with the law around it
+    law: PathLaw  # of the policy, as are model and (folded) params
     model: Model
     params: Params
-    noise: tuple[float, ...]
+    noise: tuple[float, ...]  # standard deviations of the sensors
 
 
 def closed_loop(
@@ -69,11 +63,7 @@ def closed_loop(
     law: PathLaw | None,
     noise: Sequence[float],
 ) -> Loop:
-    """Return the closed loop of a plant and a policy's parts, with folded weights.
-
-    Raises:
-        ValueError: the policy has no law, so that there is no closed loop.
-    """
+    """Return the closed loop of a plant and a policy's parts, with folded weights."""
     if law is None:
         raise ValueError(
             "a corridor needs a policy in path coordinates, with its law: "

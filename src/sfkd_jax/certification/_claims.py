@@ -306,20 +306,13 @@ class LyapunovClaim(NamedTuple):
         |e_k| ≤ c_1 α^k |e_0| + c_2 d̄ / (1 − α),   c_1 = c_2 = √κ.
 
     The printed c_2 = 1/√λ_min(P) depends on the scale of P, which is free.
-
-    Attributes:
-        rho: ρ.
-        condition: κ.
-        alpha: |F(z) − F(z')|_P ≤ α |z − z'|_P of the whole step with its residual.
-        metric: P, (rank, rank).
-        joint: multipliers of every vertex that prove α.
     """
 
-    rho: float
-    condition: float
-    alpha: float
-    metric: Matrix
-    joint: list[list[Vector]]
+    rho: float  # ρ
+    condition: float  # κ
+    alpha: float  # |F(z) − F(z')|_P ≤ α |z − z'|_P of the whole step with its residual
+    metric: Matrix  # P, (rank, rank)
+    joint: list[list[Vector]]  # multipliers of every vertex that prove α
 
     def document(self) -> dict[str, Any]:
         """Return the claim as JSON values."""

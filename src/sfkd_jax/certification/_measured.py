@@ -26,15 +26,11 @@ TAIL = 0.1
 
 
 class Residuals(NamedTuple):
-    """One-step prediction errors of every step of a run, (run, time, …).
+    """One-step prediction errors of every step of a run, (run, time, …)."""
 
-    Attributes:
-        gaps: d_k in latent coordinates.
-        outputs: 2-norms of the errors of position [m], yaw [rad] and body state; along
-            a path of e_y [m], e_ψ [rad] and the vehicle's own body state.
-    """
-
-    gaps: Float[np.ndarray, "run time rank"]
+    gaps: Float[np.ndarray, "run time rank"]  # d_k in latent coordinates
+    # 2-norms of the errors of position [m], yaw [rad] and body state; along a path of
+    # e_y [m], e_ψ [rad] and the vehicle's own body state.
     outputs: Float[np.ndarray, "run time 3"]
 
     def largest(self) -> Float[np.ndarray, "run 4"]:
@@ -136,10 +132,6 @@ def conformal_bounds(
     often. A tube multiplies the first bound by up to 1/(1 − α) and adds the others
     once, so these units make it tighter than equal quantiles do. `reference` are
     scores that fix the units, of a split other than `calibration`.
-
-    Raises:
-        ValueError: too few trajectories for the level, a level outside (0, 1), or
-            scores that are not finite.
     """
     if not 0 < level < 1:
         raise ValueError(f"a level must lie between 0 and 1, got {level}")

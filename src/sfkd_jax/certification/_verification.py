@@ -65,31 +65,19 @@ class Proved:
 
 
 class Follows(NamedTuple):
-    """An entry that is derived again.
+    """An entry that is derived again."""
 
-    Attributes:
-        value: derived; a dictionary has exactly these keys.
-        share: relative tolerance of numbers.
-    """
-
-    value: Any
-    share: float = REPEATED
+    value: Any  # derived; a dictionary has exactly these keys
+    share: float = REPEATED  # relative tolerance of numbers
 
 
 class Measured(NamedTuple):
-    """An entry that nothing binds within its range; the document is not signed.
+    """An entry that nothing binds within its range; the document is not signed."""
 
-    Attributes:
-        low: smallest value, or one a component.
-        high: largest value, or one a component.
-        kind: int, float or str.
-        whole: n if the value is a share of n, else 0.
-    """
-
-    low: Any = 0.0
-    high: Any = LARGEST
-    kind: type = float
-    whole: int = 0
+    low: Any = 0.0  # smallest value, or one a component
+    high: Any = LARGEST  # largest value, or one a component
+    kind: type = float  # int, float or str
+    whole: int = 0  # n if the value is a share of n, else 0
 
 
 Rule: TypeAlias = Proved | Follows | Measured | dict[str, Any] | list[Any]

@@ -289,17 +289,12 @@ Runs: TypeAlias = tuple[Array, Array]
 
 
 class Outcome(NamedTuple):
-    """Largest values over a run, (run,).
+    """Largest values over a run, (run,)."""
 
-    Attributes:
-        lateral: |e_y| [m].
-        distance: |e_y − ê_y| from the nominal model with the same inputs [m].
-        radius: of the tube, from the disturbances of this run [m].
-    """
-
-    lateral: Float[Array, " run"]
+    lateral: Float[Array, " run"]  # |e_y| [m]
+    # |e_y − ê_y| from the nominal model with the same inputs [m].
     distance: Float[Array, " run"]
-    radius: Float[Array, " run"]
+    radius: Float[Array, " run"]  # of the tube, from the disturbances of this run [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,21 +304,14 @@ class _Search:
     ν is held for `BLOCK` steps within its limits, e for the dwell time anywhere in its
     box, the road is a sinusoid of any wavelength and phase within the conditions at a
     constant speed. The result is a lower bound of the worst case.
-
-    Attributes:
-        claim: proved metric of e_y.
-        bound: of the radius of its tube, which is what is claimed [m].
-        data: of the data set: `ROAD_SETTINGS`, env_low and env_high.
-        held: steps between switches of e.
-        steps: in all.
     """
 
     loop: Loop
-    claim: OutputMetric
-    bound: float
-    data: Mapping[str, Any]
-    held: int
-    steps: int
+    claim: OutputMetric  # proved metric of e_y
+    bound: float  # of the radius of its tube, which is what is claimed [m]
+    data: Mapping[str, Any]  # of the data set: `ROAD_SETTINGS`, env_low and env_high
+    held: int  # steps between switches of e
+    steps: int  # in all
 
     def __call__(self, params: Params, key: Key) -> tuple[Runs, Outcome]:
         """Return the worst runs of each aim, one aim after another."""
@@ -444,12 +432,7 @@ def outcome_of(
 
 
 def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, Any]:
-    """Search for the worst runs, and repeat them with the shield in a corridor `width`.
-
-    Raises:
-        CertificateContradicted: a car left its tube while the disturbances stayed
-            within their bound, which is impossible.
-    """
+    """Search for the worst runs, and repeat them with the shield, `width` wide."""
     loop, bound = search.loop, search.bound
     found, outcome = jax.jit(search)(loop.params, key)
 

@@ -15,19 +15,12 @@ SMALLEST_P = 1e-12
 
 
 class Spread(NamedTuple):
-    """How uncertain a mean over trainings and episodes is.
+    """How uncertain a mean over trainings and episodes is."""
 
-    Attributes:
-        mean: of all entries.
-        error: standard error of the mean.
-        share: of its variance that the trainings cause, in [0, 1].
-        freedom: degrees of freedom of trainings and of episodes.
-    """
-
-    mean: float
-    error: float
-    share: float
-    freedom: tuple[int, int]
+    mean: float  # of all entries
+    error: float  # standard error of the mean
+    share: float  # of its variance that the trainings cause, in [0, 1]
+    freedom: tuple[int, int]  # degrees of freedom of trainings and of episodes
 
     def quantile(self, p: float) -> float:
         """Two-sided p-quantile of Student's t, mixed by the shares of the variance."""

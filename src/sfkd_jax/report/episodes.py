@@ -16,20 +16,17 @@ from sfkd_jax.report.tables import name_of
 
 
 class Episodes(NamedTuple):
-    """The stored episodes of a row.
-
-    Attributes:
-        lateral: signed deviation of x_1 … x_T from the path [m], left positive.
-        states: x_0 … x_T of the first episode, beginning with x, y, yaw.
-        envs: friction and wind [m/s] at every step of the first episode.
-        path: x, y, yaw, curvature along the road of the first episode.
-    """
+    """The stored episodes of a row."""
 
     row: Row
     dt: float
+    # Signed deviation of x_1 … x_T from the path [m], left positive.
     lateral: Float[np.ndarray, "episode time"]
+    # x_0 … x_T of the first episode, beginning with x, y, yaw.
     states: Float[np.ndarray, "time_plus_1 state"] | None
+    # Friction and wind [m/s] at every step of the first episode.
     envs: Float[np.ndarray, "time 2"] | None
+    # x, y, yaw, curvature along the road of the first episode.
     path: Float[np.ndarray, "point column"] | None
 
     @property

@@ -48,24 +48,15 @@ LOST = 10.0
 
 
 class LaneState(NamedTuple):
-    """What is carried from one control step to the next.
+    """What is carried from one control step to the next."""
 
-    Attributes:
-        inner: state of the controller that follows the reference.
-        planner: state of the search.
-        committed: the reference.
-        progress: of the car along the path of the lane [m].
-        wait: number of steps until the next search.
-        started: whether there is a reference.
-        doubt: number of steps until a corridor may be claimed; largest in an evasion.
-    """
-
-    inner: Any
-    planner: Any
-    committed: Committed
-    progress: Scalar
-    wait: Int[Array, ""]
-    started: Bool[Array, ""]
+    inner: Any  # state of the controller that follows the reference
+    planner: Any  # state of the search
+    committed: Committed  # the reference
+    progress: Scalar  # of the car along the path of the lane [m]
+    wait: Int[Array, ""]  # number of steps until the next search
+    started: Bool[Array, ""]  # whether there is a reference
+    # Number of steps until a corridor may be claimed; largest in an evasion.
     doubt: Int[Array, ""]
 
 

@@ -88,43 +88,27 @@ class Class:
 
 
 class Situation(NamedTuple):
-    """What references are judged by.
+    """What references are judged by."""
 
-    Attributes:
-        road: ahead.
-        committed: reference, from the same sample on.
-        obstacles: all of them finite.
-        place: of the car, in samples from the first one.
-        grip: acceleration that the tyres allow [m/s²].
-        clean: whether all of the scene is finite; nothing is free in another one.
-    """
-
-    road: RoadAhead
-    committed: Committed
-    obstacles: Obstacles
-    place: Scalar
-    grip: Scalar
+    road: RoadAhead  # ahead
+    committed: Committed  # reference, from the same sample on
+    obstacles: Obstacles  # all of them finite
+    place: Scalar  # of the car, in samples from the first one
+    grip: Scalar  # acceleration that the tyres allow [m/s²]
+    # Whether all of the scene is finite; nothing is free in another one.
     clean: Bool[Array, ""]
 
 
 class Judged(NamedTuple):
-    """What a reference is worth.
+    """What a reference is worth."""
 
-    Attributes:
-        cost: to be compared with those of others.
-        outside: how far it leaves the class, relative; not above 0 inside.
-        gap: what obstacles leave beyond what is needed [m], (sample,).
-        edge: what the edges leave [m], (sample,).
-        curve: in the world.
-        strain: how much it uses of what tyres and law can do at most.
-    """
-
-    cost: Scalar
-    outside: Scalar
+    cost: Scalar  # to be compared with those of others
+    outside: Scalar  # how far it leaves the class, relative; not above 0 inside
+    # What obstacles leave beyond what is needed [m], (sample,).
     gap: Float[Array, " sample"]
-    edge: Float[Array, " sample"]
-    curve: Curve
-    strain: Scalar
+    edge: Float[Array, " sample"]  # what the edges leave [m], (sample,)
+    curve: Curve  # in the world
+    strain: Scalar  # how much it uses of what tyres and law can do at most
 
     @property
     def blocked(self) -> Bool[Array, " sample"]:

@@ -24,17 +24,14 @@ STANDS = 1e-3
 
 
 class Committed(NamedTuple):
-    """The reference that the car follows.
+    """The reference that the car follows."""
 
-    Attributes:
-        index: of the first sample of the road; negative ones are before its start.
-        move: d [m], d' [-], d'' [1/m] at each sample, (3, sample).
-        square: v² at each sample [m²/s²], between two of them linear in s: an
-            acceleration that is constant.
-    """
-
+    # Of the first sample of the road; negative ones are before its start.
     index: Int[Array, ""]
+    # d [m], d' [-], d'' [1/m] at each sample, (3, sample).
     move: Float[Array, "3 sample"]
+    # v² at each sample [m²/s²], between two of them linear in s: an acceleration that
+    # is constant.
     square: Float[Array, " sample"]
 
     def at(self, index: Int[Array, ""], most: Float[Array, " sample"]) -> Committed:
@@ -53,49 +50,28 @@ class Committed(NamedTuple):
 
 
 class RoadAhead(NamedTuple):
-    """Samples of the road, (…, sample).
+    """Samples of the road, (…, sample)."""
 
-    Attributes:
-        position: [m], (2, sample).
-        direction: cosine and sine of the yaw, (2, sample).
-        curvature: κ [1/m].
-        slope: dκ/ds [1/m²].
-        left: to the left edge [m].
-        right: to the right edge [m].
-        wanted: v² [m²/s²], within the accelerations.
-        spacing: of the samples [m].
-    """
-
-    position: Float[Array, "2 sample"]
-    direction: Float[Array, "2 sample"]
-    curvature: Float[Array, " sample"]
-    slope: Float[Array, " sample"]
-    left: Float[Array, " sample"]
-    right: Float[Array, " sample"]
-    wanted: Float[Array, " sample"]
-    spacing: Scalar
+    position: Float[Array, "2 sample"]  # [m], (2, sample)
+    direction: Float[Array, "2 sample"]  # cosine and sine of the yaw, (2, sample)
+    curvature: Float[Array, " sample"]  # κ [1/m]
+    slope: Float[Array, " sample"]  # dκ/ds [1/m²]
+    left: Float[Array, " sample"]  # to the left edge [m]
+    right: Float[Array, " sample"]  # to the right edge [m]
+    wanted: Float[Array, " sample"]  # v² [m²/s²], within the accelerations
+    spacing: Scalar  # of the samples [m]
 
 
 class Curve(NamedTuple):
-    """A reference in the world and in time, at the samples of the road.
+    """A reference in the world and in time, at the samples of the road."""
 
-    Attributes:
-        position: [m], (2, sample).
-        direction: cosine and sine of its yaw, (2, sample).
-        curvature: of the curve itself [1/m].
-        stretch: its length per length of the road.
-        lengths: from each sample to the next [m].
-        times: when it is there, from the first sample on [s].
-        reached: whether it ever is.
-    """
-
-    position: Float[Array, "2 sample"]
-    direction: Float[Array, "2 sample"]
-    curvature: Float[Array, " sample"]
-    stretch: Float[Array, " sample"]
-    lengths: Float[Array, " gap"]
-    times: Float[Array, " sample"]
-    reached: Bool[Array, " sample"]
+    position: Float[Array, "2 sample"]  # [m], (2, sample)
+    direction: Float[Array, "2 sample"]  # cosine and sine of its yaw, (2, sample)
+    curvature: Float[Array, " sample"]  # of the curve itself [1/m]
+    stretch: Float[Array, " sample"]  # its length per length of the road
+    lengths: Float[Array, " gap"]  # from each sample to the next [m]
+    times: Float[Array, " sample"]  # when it is there, from the first sample on [s]
+    reached: Bool[Array, " sample"]  # whether it ever is
 
 
 def road_ahead(

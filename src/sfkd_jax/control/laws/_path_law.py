@@ -131,11 +131,7 @@ def _corners(
 
 
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
-    """Return the law from a dictionary of arrays, such as `law._asdict()`.
-
-    Raises:
-        KeyError: an array is missing.
-    """
+    """Return the law from a dictionary of arrays, such as `law._asdict()`."""
     return PathLaw(**{name: jnp.asarray(arrays[name]) for name in PathLaw._fields})
 
 
@@ -182,9 +178,6 @@ def derive_path_law(
             steady turns. Where the tyres give less, the law steers more, and the loop
             stays as fast.
         drive: weight, per control unit².
-
-    Raises:
-        ValueError: an axis is not ascending or has too few points.
     """
     low, high = (
         (-lateral_acceleration, speed[0], *env_low),

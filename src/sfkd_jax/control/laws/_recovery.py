@@ -59,20 +59,14 @@ class PathErrors(NamedTuple):
 
 
 class SteadyTurn(NamedTuple):
-    """Steady driving along a circle, and the feedback gain around it.
+    """Steady driving along a circle, and the feedback gain around it."""
 
-    Attributes:
-        state: path coordinates ξ* = (distance left of the path, yaw relative to it,
-            body state).
-        control: u*.
-        gain: K.
-        grip: d steering / d curvature [rad m] and the lateral acceleration a [m/s²]
-            that steering and braking may use far from the path.
-    """
-
+    # Path coordinates ξ* = (distance left of the path, yaw relative to it, body state).
     state: Float[Array, "*step coordinate"]
-    control: Float[Array, "*step control"]
-    gain: Float[Array, "*step control coordinate"]
+    control: Float[Array, "*step control"]  # u*
+    gain: Float[Array, "*step control coordinate"]  # K
+    # d steering / d curvature [rad m] and the lateral acceleration a [m/s²] that
+    # steering and braking may use far from the path.
     grip: Float[Array, "*step 2"]
 
     def feedback(self, coordinates: PathState) -> Control:
@@ -102,10 +96,6 @@ def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, Scalar, Scalar]
     Near the path ψ* is that of the linear law; farther away the vehicle can turn in on
     an arc of radius R. Returned are e_ψ − ψ* [rad], a share that is 1 where there is
     much to turn, and one that is 0 in the box `NEAR` and 1 from twice its size on.
-
-    Args:
-        turn: whose gain and grip are used.
-        errors: ξ − ξ*.
     """
     far = jnp.max(jnp.abs(errors[: PATH_SPEED + 1]) / jnp.asarray(NEAR)) - 1.0
     aside, steering = jnp.abs(errors[LATERAL]), turn.gain[0]
@@ -130,12 +120,6 @@ def recovering(
     That is at twice that distance and beyond; in between it is a mixture. The vehicle
     is slower, the more it has to turn, and speeds up once it points the right way;
     steering and drive share the grip a.
-
-    Args:
-        turn: whose control, gain and grip are used.
-        errors: ξ − ξ*.
-        linear: u* − K (ξ − ξ*).
-        speed_loop: whether the second control is a speed.
     """
     turned, astray, far = course(turn, errors)
     (bend, grip), speed, gain = turn.grip, turn.state[PATH_SPEED], turn.gain

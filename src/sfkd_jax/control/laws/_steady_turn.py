@@ -109,13 +109,7 @@ def riccati_gain(
     state_weights: tuple[float, ...],
     control_weights: Float[Array, " 2"],
 ) -> Float[Array, "2 coordinate"]:
-    """Return K of the Riccati recursion; 0 where it is not finite.
-
-    Args:
-        slopes: (A, B) of one step.
-        state_weights: of the first coordinates; further ones weigh nothing.
-        control_weights: of u.
-    """
+    """Return K of the Riccati recursion; 0 where it is not finite."""
     A, B = jnp.split(slopes, [slopes.shape[0]], axis=1)
     diagonal = jnp.zeros(A.shape[0]).at[: len(state_weights)]
     Q, R = jnp.diag(diagonal.set(jnp.asarray(state_weights))), jnp.diag(control_weights)

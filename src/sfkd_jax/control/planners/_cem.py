@@ -43,7 +43,6 @@ class Cem(SamplingPlanner):
     smallest_scale: float = 0.05
 
     def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
         if not 1 <= self.elites <= self.num_samples:
             raise ValueError(

@@ -46,7 +46,6 @@ class GradientPlanner(Planner):
     shrink: Fraction = 0.4
 
     def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
         check_intervals(self)
         if self.task.constraint is not None:

@@ -55,7 +55,6 @@ class Mppi(SamplingPlanner):
     effective_samples: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
         size, most = self.effective_samples, self.num_samples
         if size and not 1 <= size <= most:

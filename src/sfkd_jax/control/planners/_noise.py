@@ -47,7 +47,6 @@ class SamplingPlanner(Planner):
     noise_knots: AtLeastTwo = 5
 
     def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
         super().__post_init__()
         check_intervals(self)
         check_choice("noise", self.noise, KINDS)

@@ -46,41 +46,26 @@ class Tuning(NamedTuple):
 
 
 class PlannerState(NamedTuple):
-    """What a planner carries from one control step to the next.
+    """What a planner carries from one control step to the next."""
 
-    Attributes:
-        plan: rows ν_0 … ν_{T-1}, perturbations of the task's law if it has one.
-        controls: the controls of the last healthy rollout of that plan.
-        previous: the control applied last.
-        started: whether a control was planned before.
-        key: data of the random key of the next samples: the state is plain arrays.
-        tuning: see `Tuning`.
-    """
-
-    plan: Plan
-    controls: Plan
-    previous: Control
-    started: Bool[Array, ""]
+    plan: Plan  # rows ν_0 … ν_{T-1}, perturbations of the task's law if it has one
+    controls: Plan  # the controls of the last healthy rollout of that plan
+    previous: Control  # the control applied last
+    started: Bool[Array, ""]  # whether a control was planned before
+    # Data of the random key of the next samples: the state is plain arrays.
     key: UInt32[Array, " word"]
-    tuning: Tuning
+    tuning: Tuning  # see `Tuning`
 
 
 class Evaluated(NamedTuple):
-    """What the rollouts of plans came to.
+    """What the rollouts of plans came to."""
 
-    Attributes:
-        costs: of the whole rollouts.
-        controls: applied, within the limits.
-        perturbations: the parts of the plans that the limits allowed.
-        states: predicted, (horizon, sample, …).
-        violations: the largest of a constraint over the horizon, not above 0 where all
-            are kept; None without constraints.
-    """
-
-    costs: Float[Array, " sample"]
-    controls: Plans
-    perturbations: Plans
-    states: Any
+    costs: Float[Array, " sample"]  # of the whole rollouts
+    controls: Plans  # applied, within the limits
+    perturbations: Plans  # the parts of the plans that the limits allowed
+    states: Any  # predicted, (horizon, sample, …)
+    # The largest of a constraint over the horizon, not above 0 where all are kept; None
+    # without constraints.
     violations: Float[Array, " sample"] | None
 
     def ranked(self) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
@@ -153,7 +138,6 @@ class Planner(Stateful):
     env_high: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Raise a ValueError that names a setting out of its range."""
         shape, std = self.task.low.shape, self.noise_std
         if shape not in ((), (len(std),)) or not all(entry > 0 for entry in std):
             raise ValueError(f"noise_std needs a positive number a control, got {std}")

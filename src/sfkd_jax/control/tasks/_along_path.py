@@ -55,27 +55,19 @@ from sfkd_jax.types import (
 
 
 class Preview(NamedTuple):
-    """The road ahead, as controllers along a path see it.
+    """The road ahead, as controllers along a path see it."""
 
-    Attributes:
-        road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
-            finite.
-        along: distance of the observed position from the first point of the reference,
-            along the path [m]; behind a `Gate` of the last one that was believed.
-        repeated: whether the observation is bit for bit the last one, as of a sensor
-            that freezes.
-        measured: which entries of ξ are measured; behind a `Gate` the others are
-            predicted.
-        on_time: whether the last call was one period ago.
-        trusted: whether the certificate may be claimed, see `Gate`.
-    """
-
+    # κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not finite.
     road: Float[Array, "horizon 2"]
+    # Distance of the observed position from the first point of the reference, along the
+    # path [m]; behind a `Gate` of the last one that was believed.
     along: Scalar
+    # Whether the observation is bit for bit the last one, as of a sensor that freezes.
     repeated: Bool[Array, ""]
+    # Which entries of ξ are measured; behind a `Gate` the others are predicted.
     measured: Bool[Array, " coordinate"]
-    on_time: Bool[Array, ""]
-    trusted: Bool[Array, ""]
+    on_time: Bool[Array, ""]  # whether the last call was one period ago
+    trusted: Bool[Array, ""]  # whether the certificate may be claimed, see `Gate`
 
 
 class AlongReferenceState(NamedTuple):
@@ -182,9 +174,6 @@ class FollowingLaw(LawTask):
     Attributes:
         law: the one that the model was learned around. All others are those of
             `LawTask`, the model in path coordinates.
-
-    Raises:
-        ValueError: the model is not in path coordinates.
     """
 
     law: PathLaw
@@ -290,9 +279,6 @@ def requesting(planner: Controller, horizon: int, coordinates: int) -> Controlle
         planner: any.
         horizon: number of steps of the reference.
         coordinates: size of ξ.
-
-    Raises:
-        ValueError: (when called) the planner's control is not that of a vehicle.
     """
 
     def init(key: Key) -> Request:

@@ -50,9 +50,6 @@ class FreeTask:
         dt: sampling period [s], which `control_rate` needs.
         terminal: φ(weights, x_T, ref_T).
         weights: a pytree of numbers that both costs read, see `Tuning.cost`.
-
-    Raises:
-        ValueError: the limits are inconsistent, or a rate is given without `dt`.
     """
 
     dynamics: Callable[[Params, Any, Control, Any], Any]
@@ -66,7 +63,6 @@ class FreeTask:
     weights: Any = ()
 
     def __post_init__(self) -> None:
-        """Raise a ValueError for inconsistent limits."""
         if self.control_rate is not None and self.dt is None:
             raise ValueError("control_rate needs dt, the sampling period in seconds")
         _ = self.limit

@@ -132,33 +132,21 @@ def tracking_cost(
 
 
 class PathSample(NamedTuple):
-    """State of one rollout along a path.
+    """State of one rollout along a path."""
 
-    Attributes:
-        latent: of the model.
-        state: decoded from it; kept, because the law of the next step needs it again.
-        errors: of the last step from the path.
-        control: of the last step.
-    """
-
-    latent: Any
+    latent: Any  # of the model
+    # Decoded from it; kept, because the law of the next step needs it again.
     state: State
-    errors: PathErrors
-    control: Control
+    errors: PathErrors  # of the last step from the path
+    control: Control  # of the last step
 
 
 class PathTarget(NamedTuple):
-    """The reference of one step.
+    """The reference of one step."""
 
-    Attributes:
-        point: x, y, yaw, speed.
-        curvature: of the path there [1/m].
-        turn: `SteadyTurn` of the law, or None if it is not a `ModelLaw`.
-    """
-
-    point: Float[Array, "*horizon 4"]
-    curvature: Float[Array, "*horizon"]
-    turn: Any
+    point: Float[Array, "*horizon 4"]  # x, y, yaw, speed
+    curvature: Float[Array, "*horizon"]  # of the path there [1/m]
+    turn: Any  # `SteadyTurn` of the law, or None if it is not a `ModelLaw`
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,9 +163,6 @@ class LawTask:
         control_high: upper control limits.
         control_rate: largest change of a control per second, or None.
         terminal_weight: w_T, added to the weight of the last step.
-
-    Raises:
-        ValueError: the limits are inconsistent, see `actuator_limits`.
     """
 
     model: Model
@@ -191,7 +176,6 @@ class LawTask:
     terminal_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raise a ValueError for inconsistent limits."""
         _ = self.limit
 
     def task(self, check: Callable[..., Any]) -> Task:

@@ -54,15 +54,10 @@ model alone by more than this factor.
 
 
 class AdaptiveState(NamedTuple):
-    """What the adaptation carries from one control step to the next.
+    """What the adaptation carries from one control step to the next."""
 
-    Attributes:
-        inner: state of the wrapped controller.
-        belief: of the estimator; the part to save and resume.
-    """
-
-    inner: Any
-    belief: Belief
+    inner: Any  # state of the wrapped controller
+    belief: Belief  # of the estimator; the part to save and resume
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,9 +112,6 @@ class Adaptation(Stateful):
             ignored.
         model_error: standard deviation of one step of the model, per entry of ξ;
             further entries are ignored.
-
-    Raises:
-        ValueError: a setting is out of its range or has the wrong number of entries.
 
     Source: Blom and Bar-Shalom (1988); Pannocchia and Rawlings (2003).
     """

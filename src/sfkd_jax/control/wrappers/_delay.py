@@ -24,14 +24,10 @@ from sfkd_jax.types import (
 
 
 class DelayState(NamedTuple):
-    """What delay compensation carries from one control step to the next.
+    """What delay compensation carries from one control step to the next."""
 
-    Attributes:
-        inner: state of the wrapped controller.
-        sent: controls that have not arrived yet, oldest first.
-    """
-
-    inner: Any
+    inner: Any  # state of the wrapped controller
+    # Controls that have not arrived yet, oldest first.
     sent: Float[Array, "delay control"]
 
 
@@ -50,9 +46,6 @@ class DelayCompensation(Stateful):
         inner: any controller.
         model: used for the prediction; usually that of the controller's rollouts.
         delay: d, at least 1.
-
-    Raises:
-        ValueError: the delay is less than 1, or the model is in path coordinates.
     """
 
     inner: Controller

@@ -45,17 +45,11 @@ LEAST_LIKELIHOOD = 1e-9
 
 
 class Bank(NamedTuple):
-    """The Gaussian estimates of all filters and their probabilities.
+    """The Gaussian estimates of all filters and their probabilities."""
 
-    Attributes:
-        means: of the estimated vector.
-        covariances: of its errors.
-        probabilities: of the filters.
-    """
-
-    means: Float[Array, "filter n"]
-    covariances: Float[Array, "filter n n"]
-    probabilities: Float[Array, " filter"]
+    means: Float[Array, "filter n"]  # of the estimated vector
+    covariances: Float[Array, "filter n n"]  # of its errors
+    probabilities: Float[Array, " filter"]  # of the filters
 
     def mean(self) -> Float[Array, " n"]:
         """Return the mean over all filters."""
@@ -74,10 +68,6 @@ def mixed(bank: Bank, transition: Float[Array, "filter filter"]) -> Bank:
         c_j = Σ_i Π_ij p_i,   x̄_j = Σ_i Π_ij p_i x_i / c_j
 
     P̄_j is the covariance of that mixture. Source: Blom and Bar-Shalom (1988).
-
-    Args:
-        bank: before the transition.
-        transition: Π, rows sum to 1.
     """
     joint = transition * bank.probabilities[:, None]
     expected = joint.sum(axis=0)
@@ -99,11 +89,6 @@ def corrected(
 
     The sensors are independent and processed one by one, in Joseph's form, which keeps
     covariances positive in float32.
-
-    Args:
-        bank: predicted.
-        measurement: of the first entries of the vector.
-        variances: of the sensors.
 
     Returns:
         The bank, and False if every filter is farther away than `OUTLIER` or is not
@@ -170,19 +155,12 @@ def input_error(causes: Float[Array, " cause"], road: Float[Array, " 2"]) -> Con
 
 
 class Loop(NamedTuple):
-    """The learned closed loop and the box of its environments.
+    """The learned closed loop and the box of its environments."""
 
-    Attributes:
-        model: in path coordinates, without offset.
-        law: around which it was learned.
-        low: lower end of E.
-        high: upper end of E; wind in [-high, high].
-    """
-
-    model: Model
-    law: PathLaw
-    low: Environment
-    high: Environment
+    model: Model  # in path coordinates, without offset
+    law: PathLaw  # around which it was learned
+    low: Environment  # lower end of E
+    high: Environment  # upper end of E; wind in [-high, high]
 
     def relative_force(self, env: Environment) -> Scalar:
         """Return the side force w|w| relative to the largest one in E."""
@@ -261,37 +239,24 @@ class Loop(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """What is known between two control steps: arrays to save and to resume.
+    """What is known between two control steps: arrays to save and to resume."""
 
-    Attributes:
-        bank: of (ξ, causes).
-        applied: what acted on the vehicle since the last step.
-        scores: squared normalised errors of one-step predictions, with the causes and
-            without, averaged over the last seconds.
-    """
-
-    bank: Bank
-    applied: Applied
+    bank: Bank  # of (ξ, causes)
+    applied: Applied  # what acted on the vehicle since the last step
+    # Squared normalised errors of one-step predictions, with the causes and without,
+    # averaged over the last seconds.
     scores: Float[Array, " 2"]
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """An extended Kalman filter for each hypothesis on friction and jumps of the force.
+    """An extended Kalman filter for each hypothesis on friction and on jumps of f."""
 
-    Attributes:
-        loop: the learned closed loop.
-        transition: of the Markov chain of the filters.
-        frictions: of the filters; NaN where friction is measured.
-        sensors: variances of the measured ξ.
-        noise: Q of the filters.
-    """
-
-    loop: Loop
-    transition: Float[Array, "filter filter"]
-    frictions: Float[Array, " filter"]
-    sensors: Float[Array, " sensor"]
-    noise: Float[Array, "filter vector vector"]
+    loop: Loop  # the learned closed loop
+    transition: Float[Array, "filter filter"]  # of the Markov chain of the filters
+    frictions: Float[Array, " filter"]  # of the filters; NaN where friction is measured
+    sensors: Float[Array, " sensor"]  # variances of the measured ξ
+    noise: Float[Array, "filter vector vector"]  # Q of the filters
 
     def follow(
         self,
@@ -306,12 +271,6 @@ class Estimator:
         the force could explain, is rejected: the causes stay as predicted, so that a
         sensor that freezes or jumps is never taken for a force. If it is usable, ξ
         starts anew from it.
-
-        Args:
-            params: of the model, folded.
-            belief: before.
-            measured: ξ at the end of the step, may be not finite.
-            usable: whether it is measured, see `Gate`.
         """
         size = measured.shape[0]
         expected = self._advanced(params, belief)

@@ -91,34 +91,25 @@ ANYWHERE = Conditions()
 
 
 class GateState(NamedTuple):
-    """What the gate carries from one control step to the next.
+    """What the gate carries from one control step to the next."""
 
-    Attributes:
-        inner: state of the wrapped controller.
-        expected: ξ predicted for this step; NaN before the first measurement.
-        modelled: whether the model predicted it, inside the conditions.
-        along: distance along the path of the last measured position, see `Preview`.
-        missing: number of steps since a coordinate was last used.
-        skew: what a wrong pose adds to the relative yaw [rad]; 0 for a right one.
-        doubt: number of steps until the certificate may be claimed again, after a
-            measurement was believed that nothing explains.
-        env: the last finite environment.
-        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
-            0 before the first one.
-        test: of the innovations, or None.
-        past: estimates of ξ at the last steps, newest first, and κ there [1/m].
-    """
-
-    inner: Any
-    expected: PathState
-    modelled: Bool[Array, ""]
+    inner: Any  # state of the wrapped controller
+    expected: PathState  # ξ predicted for this step; NaN before the first measurement
+    modelled: Bool[Array, ""]  # whether the model predicted it, inside the conditions
+    # Distance along the path of the last measured position, see `Preview`.
     along: Scalar
+    # Number of steps since a coordinate was last used.
     missing: Int[Array, " coordinate"]
-    skew: Scalar
+    skew: Scalar  # what a wrong pose adds to the relative yaw [rad]; 0 for a right one
+    # Number of steps until the certificate may be claimed again, after a measurement
+    # was believed that nothing explains.
     doubt: Int[Array, ""]
-    env: Environment
+    env: Environment  # the last finite environment
+    # κ [1/m] and v_ref [m/s] over the next steps of the last finite reference; 0 before
+    # the first one.
     road: Float[Array, "preview 2"]
-    test: InnovationState | None
+    test: InnovationState | None  # of the innovations, or None
+    # Estimates of ξ at the last steps, newest first, and κ there [1/m].
     past: Float[Array, "step coordinate+1"]
 
 

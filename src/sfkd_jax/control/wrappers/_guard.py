@@ -50,21 +50,13 @@ FILTER_SCALES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)
 
 
 class FilterResult(NamedTuple):
-    """The outcome of `safety_filter`.
+    """The outcome of `safety_filter`."""
 
-    Attributes:
-        nu: the perturbation of the law to apply, (2,).
-        latent: of the nominal model one step later.
-        scale: s, of the request clipped to its limit; 0 while steering back.
-        margin: width − max |ê_y| over the predicted steps [m]; −inf if not finite.
-        feasible: whether the margin is at least 0.
-    """
-
-    nu: Control
-    latent: Latent
-    scale: Scalar
-    margin: Scalar
-    feasible: Bool[Array, ""]
+    nu: Control  # the perturbation of the law to apply, (2,)
+    latent: Latent  # of the nominal model one step later
+    scale: Scalar  # s, of the request clipped to its limit; 0 while steering back
+    margin: Scalar  # width − max |ê_y| over the predicted steps [m]; −inf if not finite
+    feasible: Bool[Array, ""]  # whether the margin is at least 0
 
 
 def safety_filter(
@@ -138,23 +130,17 @@ def safety_filter(
 
 
 class ShieldState(NamedTuple):
-    """The wrapped controller and the nominal model between two control steps.
+    """The wrapped controller and the nominal model between two control steps."""
 
-    Attributes:
-        inner: state of the wrapped controller.
-        latent: of the nominal model, in the fibre of `env`; 0 before the start.
-        started: whether the nominal model is running and the loop was closed around the
-            vehicle since; otherwise it starts anew at the next measurement.
-        env: that of the last step, clipped to its box; NaN before the first one.
-        offset: what the start adds to the bound of |e_y − ê_y| [m].
-        rolling: bound of |e_y| at the next step whatever steers [m]; NaN without one.
-    """
-
-    inner: Any
-    latent: Latent
+    inner: Any  # state of the wrapped controller
+    latent: Latent  # of the nominal model, in the fibre of `env`; 0 before the start
+    # Whether the nominal model is running and the loop was closed around the vehicle
+    # since; otherwise it starts anew at the next measurement.
     started: Bool[Array, ""]
+    # That of the last step, clipped to its box; NaN before the first one.
     env: Environment
-    offset: Scalar
+    offset: Scalar  # what the start adds to the bound of |e_y − ê_y| [m]
+    # Bound of |e_y| at the next step whatever steers [m]; NaN without one.
     rolling: Scalar
 
 

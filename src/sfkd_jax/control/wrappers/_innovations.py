@@ -23,19 +23,13 @@ Readings = Float[Array, " chart"]  # ξ, and its heading once more
 
 
 class InnovationState(NamedTuple):
-    """What the test carries from one control step to the next.
+    """What the test carries from one control step to the next."""
 
-    Attributes:
-        expected: of this step, predicted from the last measured one; NaN without.
-        level: of the prediction, see `steering_level`.
-        means: moving means of the scores.
-        alarm: whether the last step raised or kept one.
-    """
-
+    # Of this step, predicted from the last measured one; NaN without.
     expected: Readings
-    level: Scalar
-    means: Means
-    alarm: Bool[Array, ""]
+    level: Scalar  # of the prediction, see `steering_level`
+    means: Means  # moving means of the scores
+    alarm: Bool[Array, ""]  # whether the last step raised or kept one
 
 
 class InnovationTest(NamedTuple):
@@ -78,13 +72,7 @@ class InnovationTest(NamedTuple):
         xi: PathState,
         measured: Bool[Array, " coordinate"],
     ) -> tuple[InnovationState, Scalar]:
-        """Return the state after a measurement, and the statistic.
-
-        Args:
-            state: before.
-            xi: measured.
-            measured: its entries that are believed; the others are not compared.
-        """
+        """Return the state after a measurement, and the statistic."""
         seen = jnp.where(measured, xi, jnp.nan)
         innovation = jnp.append(seen, seen[HEADING]) - state.expected
         means = self.moved(state.means, innovation, state.level)

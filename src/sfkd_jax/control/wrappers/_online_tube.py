@@ -33,24 +33,18 @@ GRIP_SHARE = 0.8
 
 
 class OnlineTubeState(NamedTuple):
-    """What the calibration carries from one control step to the next.
+    """What the calibration carries from one control step to the next."""
 
-    Attributes:
-        inner: state of the wrapped controller.
-        plans: e_y that the last plans predicted, newest first [m]; NaN where a plan is
-            not finite, and before there was one.
-        radii: r_h of the tube [m].
-        corridor_factor: of the reference speed, at which the corridor fits the lane.
-        speed_factor: of the reference speed that is followed.
-        grip: lateral acceleration at which the corridor fitted the lane [m/s²]; 0 if
-            it is not limited.
-    """
-
-    inner: Any
+    inner: Any  # state of the wrapped controller
+    # e_y that the last plans predicted, newest first [m]; NaN where a plan is not
+    # finite, and before there was one.
     plans: Float[Array, "horizon horizon"]
-    radii: Float[Array, " horizon"]
+    radii: Float[Array, " horizon"]  # r_h of the tube [m]
+    # Of the reference speed, at which the corridor fits the lane.
     corridor_factor: Scalar
-    speed_factor: Scalar
+    speed_factor: Scalar  # of the reference speed that is followed
+    # Lateral acceleration at which the corridor fitted the lane [m/s²]; 0 if it is not
+    # limited.
     grip: Scalar
 
 
@@ -96,9 +90,6 @@ class OnlineTube(Stateful):
     `info` gains `tube` (horizon,) [m], `tube_errors` (horizon,) [m]
         (NaN without a plan to compare with), `tube_missed` (horizon,),
         `online_corridor` [m], `speed_factor` and `grip` [m/s²; 0 without limit].
-
-    Raises:
-        ValueError: a setting is out of its range.
 
     Source: Gibbs and Candès (2021), Adaptive Conformal Inference Under Distribution
     Shift.
