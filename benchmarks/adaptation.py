@@ -8,7 +8,6 @@ on episodes of seed 100. Writes benchmarks/adaptation.json, one line a row.
 
 import json
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -181,19 +180,8 @@ def drive(car, system, scene):
 
 def main():
     """Drive and write."""
-    out, protocol = Path(__file__).with_suffix(".json"), ("episodes", "seconds", "seed")
-    given, rows = (
-        arguments(
-            __doc__,
-            cars=CARS,
-            cases=CASES,
-            episodes=16,
-            seconds=30.0,
-            seed=2027,
-            out=out,
-        ),
-        [],
-    )
+    protocol, rows = {"episodes": 16, "seconds": 30.0, "seed": 2027}, []
+    given = arguments(__doc__, __file__, cars=CARS, cases=CASES, **protocol)
     for name in given.cars:
         loaded = policy.load(SHIPPED / f"{name}_path")
         for label in given.cases:

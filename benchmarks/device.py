@@ -117,13 +117,7 @@ def episodes(name, samples, count, seed):
 def main():
     """Measure, print and store."""
     asked = arguments(
-        __doc__,
-        cars=CARS,
-        samples=[1500],
-        steps=200,
-        episodes=16,
-        seed=2026,
-        out=Path(__file__).with_suffix(".json"),
+        __doc__, __file__, cars=CARS, samples=[1500], steps=200, episodes=16, seed=2026
     )
     device, policies = jax.devices()[0].device_kind, {}
     for name in asked.cars:

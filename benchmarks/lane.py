@@ -8,19 +8,18 @@ the same in the guard along the road. Writes benchmarks/lane.json, one line a ro
 is there is not measured again.
 """
 
-import argparse
 import json
 import time
 from itertools import product
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-import sfkd_jax
-from benchmarks.recovery import CARS, HORIZON, NOISE, PERIOD, SHIPPED, shown
-from sfkd_jax import control, evaluation, models, scenarios
+from benchmarks import arguments, as_lines, device, search, total
+from benchmarks.device import CARS, HORIZON, PERIOD, driving
+from benchmarks.recovery import shown
+from sfkd_jax import control, models, scenarios
 from sfkd_jax.lanes import circles, clearance
 from sfkd_jax.types import Controller
 
@@ -37,11 +36,8 @@ SYSTEMS = ("lane", "oracle", "oracle" + GUARDED)
 class Car:
     """A shipped policy, its true car, and the systems that drive it."""
 
-    def __init__(self, name, samples, system):
-        directory = SHIPPED / f"{name}_path"
-        planner = sfkd_jax.load(directory).settings["controller"]
-        mppi = planner["mppi"] | {"num_samples": samples}
-        self.policy = sfkd_jax.load(directory, controller=planner | {"mppi": mppi})
+    def __init__(self, name, samples):
+        self.policy = device.loaded(name, samples)
         self.plant, self.samples = self.policy.vehicle, samples
 
     def system(self, name):
@@ -65,20 +61,14 @@ class Car:
 
     def program(self, name):
         """(scenarios) -> what is recorded of their episodes, (run, time)."""
-        system, claims = self.system(name), name != "oracle"
+        # The oracle claims nothing.
+        record = {"corridor": lambda info: info["corridor"]} if name != "oracle" else {}
+        episode = driving(
+            self.plant.step, self.system(name), self.policy.params, record=record
+        )
 
         def run(scenario, key):
-            made = evaluation.simulate(
-                self.plant.step,
-                system,
-                self.policy.params,
-                scenario,
-                key,
-                dt=PERIOD,
-                horizon=HORIZON,
-                observation_noise=NOISE,
-                record={"corridor": lambda info: info["corridor"]} if claims else {},
-            )
+            made = episode(scenario, key)
             # From the middle of the road, also where another reference is followed.
             foot = jax.vmap(scenarios.point_at, (None, 0))(scenario.path, made.progress)
             away, yaw = made.states[1:, :2] - foot[:, :2], foot[:, 2]
@@ -130,14 +120,8 @@ def on_road(controller):
 
 def courses(car, count, seed):
     """Roads of the scenario."""
-    family = scenarios.scenario(
-        name="obstacles",
-        duration=STEPS * PERIOD,
-        state_size=len(car.plant.state_names),
-        dt=PERIOD,
-        peak_curvature=0.004,
-        wavelengths=(100.0, 300.0),
-    )
+    bends = {"peak_curvature": 0.004, "wavelengths": (100.0, 300.0)}
+    family = device.family(car.plant, "obstacles", STEPS * PERIOD, **bends)
     return jax.jit(jax.vmap(family))(jax.random.split(jax.random.key(seed), count))
 
 
@@ -201,7 +185,7 @@ def pedestrian_rows(car, drive, given):
 def enemy_rows(car, drive, given):
     """Places, and when they are seen first, by a cross-entropy search."""
     draw, base = np.random.default_rng(39), courses(car, given.runs, 39)
-    mean, spread, found, hits = np.zeros(3 * base.course.along.shape[1]), 1.0, [], []
+    found, hits = [], []
 
     def roads(genes, latest):
         gaps, sides, sight = np.split(np.clip(genes, -1.0, 1.0), 3, axis=1)
@@ -209,8 +193,7 @@ def enemy_rows(car, drive, given):
         view = latest + 10.0 * (sight + 1.0)
         return placed(base, along, 3.0 * sides, view, radius=0.8, until=640.0)
 
-    for _ in range(given.generations):
-        genes = mean + spread * draw.normal(size=(given.runs, len(mean)))
+    def reward(genes):
         made = drive(roads(genes, APPEAR))
         near = made["gap"].min(axis=1)
         found.append(counted(car, made))
@@ -219,16 +202,14 @@ def enemy_rows(car, drive, given):
             known = drive(roads(genes, 500.0))["gap"].min(axis=1)
             hits.append(int(((near < 0.0) & (known >= 0.0)).sum()))
         # Of those that come as near, the slower run is worse.
-        order = np.argsort(near + 1e-4 * made["along"][:, -1])
-        best = genes[order[: max(2, given.runs // 10)]]
-        mean, spread = best.mean(axis=0), np.maximum(best.std(axis=0), 0.1)
-    whole = {
-        k: sum(one[k] for one in found) for k, v in found[0].items() if type(v) is int
-    }
+        return -near - 1e-4 * made["along"][:, -1]
+
+    size = given.runs, 3 * base.course.along.shape[1]
+    search(draw, size, given.generations, reward)
     least = min(one["smallest_clearance_m"] for one in found)
     yield (
         "enemy",
-        found[-1] | whole | {"smallest_clearance_m": least, "avoidable": sum(hits)},
+        total(found) | {"smallest_clearance_m": least, "avoidable": sum(hits)},
     )
 
 
@@ -268,17 +249,17 @@ ROWS = {
 
 def main():
     """Drive, print and write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    given = arguments(
+        __doc__,
+        __file__,
+        cars=CARS,
+        systems=SYSTEMS,
+        rows=ROWS,
+        runs=200,
+        generations=4,
+        samples=1500,
     )
-    parser.add_argument("--cars", nargs="*", choices=CARS, default=CARS)
-    parser.add_argument("--systems", nargs="*", choices=SYSTEMS, default=SYSTEMS)
-    parser.add_argument("--rows", nargs="*", choices=ROWS, default=[*ROWS])
-    parser.add_argument("--runs", type=int, default=200, help="at once")
-    parser.add_argument("--generations", type=int, default=4)
-    parser.add_argument("--samples", type=int, default=1500)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_suffix(".json"))
-    given, began = parser.parse_args(), time.perf_counter()
+    began = time.perf_counter()
     rows = json.loads(given.out.read_text("utf-8")) if given.out.exists() else []
     about = {"samples": given.samples, "device": jax.devices()[0].device_kind}
     done = {(row["car"], row["system"], row["group"]) for row in rows}
@@ -287,7 +268,7 @@ def main():
         missing = [one for one in missing if one != "time" or system == "lane"]
         if not missing:
             continue
-        car = Car(name, given.samples, system)
+        car = Car(name, given.samples)
         drive = car.program(system)
         for group in missing:
             for label, found in ROWS[group](car, drive, given):
@@ -295,8 +276,7 @@ def main():
                 rows.append(named | found | about)
                 print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)
             # After every group: a run that is cut off goes on where it was.
-            lines = [json.dumps(row, separators=(",", ":")) for row in rows]
-            given.out.write_text("[\n" + ",\n".join(lines) + "\n]\n", "utf-8")
+            given.out.write_text(as_lines(rows) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ no other choice (seed 2031).
 """
 
 from itertools import product
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,9 +15,9 @@ from benchmarks import arguments, device, write
 
 def main():
     """Drive and write."""
-    out = Path(__file__).with_suffix(".json")
-    given = arguments(__doc__, episodes=8, seconds=30.0, seed=2031, out=out)
-    head = {key: getattr(given, key) for key in ("episodes", "seconds", "seed")}
+    protocol = {"episodes": 8, "seconds": 30.0, "seed": 2031}
+    given = arguments(__doc__, __file__, **protocol)
+    head = {key: getattr(given, key) for key in protocol}
     keys, rows = jax.random.split(jax.random.key(given.seed), given.episodes), []
     for name, scenario, samples in product(
         device.CARS[::-1], ("s2", "s3"), (1500, 300)

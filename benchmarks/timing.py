@@ -17,13 +17,11 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib import metadata
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks import arguments
 
-HOME = Path(__file__).parent
 RANK, CONTROLS, OUTPUTS, WIDTH = 32, 2, 4, 64
 NOISE, TEMPERATURE, EFFORT = 0.4, 1.0, 0.01
 LOW, HIGH = -2.0, 2.0
@@ -281,8 +279,7 @@ def versions():
 
 def main():
     """Parse, run, write."""
-    out = HOME / "timing.json"
-    given = arguments(__doc__, rounds=3, steps=40, only=CONTENDERS, out=out)
+    given = arguments(__doc__, __file__, rounds=3, steps=40, only=CONTENDERS)
     # Another job beside a benchmark spoils its times: the load says whether there was.
     load, rounds = os.getloadavg()[0], {name: [] for name in given.only}
     for _ in range(given.rounds):

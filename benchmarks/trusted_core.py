@@ -21,8 +21,7 @@ from benchmarks import arguments  # noqa: E402
 from sfkd_jax import store  # noqa: E402
 
 if __name__ == "__main__":
-    out = Path(__file__).with_suffix(".json")
-    given = arguments(__doc__, cases=200_000, seed=1, out=out)
+    given = arguments(__doc__, __file__, cases=200_000, seed=1)
     began, about = time.perf_counter(), {"cases": given.cases, "seed": given.seed}
     counts = {"false_and_accepted": 0, **search(given.cases, given.seed)}
     spent = {"seconds": round(time.perf_counter() - began)}

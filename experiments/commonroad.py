@@ -9,7 +9,6 @@ along the path. Writes experiments/commonroad.json.
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -75,13 +74,8 @@ def drive(car, controller, params, track):
 
 def main():
     """Parse, drive, write."""
-    out, protocol = Path(__file__).with_suffix(".json"), ("paths", "seconds", "seed")
-    given, rows = (
-        arguments(
-            __doc__, cars=("std", "mb"), paths=3, seed=2027, seconds=60.0, out=out
-        ),
-        [],
-    )
+    protocol, rows = {"paths": 3, "seconds": 60.0, "seed": 2027}, []
+    given = arguments(__doc__, __file__, cars=("std", "mb"), **protocol)
     for name in given.cars:
         car = adapters.commonroad_vehicle(model=name)
         track = roads(car, given.paths, given.seconds, given.seed)
