@@ -24,15 +24,10 @@ from sfkd_jax.types import (
 
 
 class Folded(NamedTuple):
-    """Parameters of a controller: `Model.fiber` need not bound or factorise them again.
+    """Parameters of a controller, which `Model.fiber` need not factorise again."""
 
-    Attributes:
-        weights: the parameters as they were learned and stored.
-        shared: `Model.shared` of these parameters.
-    """
-
-    weights: Params
-    shared: Any
+    weights: Params  # the parameters as they were learned and stored
+    shared: Any  # `Model.shared` of these parameters
 
 
 def fold(model: Model, params: Params) -> Params:
@@ -56,15 +51,11 @@ class Offset(NamedTuple):
     """Parameters of a model together with a shift of its steps.
 
     `Model.fiber` of these parameters is an `Offset` as well, of the model's own fiber.
-
-    Attributes:
-        params: of the model, folded or not; in a fiber, the fiber of the model.
-        inputs: added to every control, as a bias of B(e) u and of the residual.
-        latent: added to every latent step, a pytree like the latent; None for nothing.
     """
 
-    params: Any
-    inputs: Control
+    params: Any  # of the model, folded or not; in a fiber, the fiber of the model
+    inputs: Control  # added to every control, as a bias of B(e) u and of the residual
+    # Added to every latent step, a pytree like the latent; None for nothing.
     latent: Latent | None
 
 

@@ -239,7 +239,7 @@ def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
     ("search", "settings", "words"),
     [
         ("mppi", {"effective_samples": 401.0}, "effective_samples"),
-        ("mppi", {"horizon": 0}, "horizon and unroll"),
+        ("mppi", {"horizon": 0}, "horizon must be in"),
         ("mppi", {"noise": "pink"}, "noise must be one of"),
         ("mppi", {"noise": "spline", "noise_knots": 13}, "noise_knots"),
         ("mppi", {"noise_std": (0.0,)}, "noise_std"),

@@ -42,29 +42,20 @@ Box: TypeAlias = Sequence[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Claims:
-    """Constants proved in the 2-norm, with their witnesses.
+    """Constants proved in the 2-norm, with their witnesses."""
 
-    Attributes:
-        scope: the environments, and how all of them are covered.
-        alpha: contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z',
-            u and all e of the scope: the smaller of the next two.
-        alpha_separate: ρ + β.
-        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
-        rho: sup_e ||A(e)||.
-        beta: Lipschitz constant of r in z.
-        lipschitz: Lipschitz constants of the decoder's outputs "position" [m], "yaw"
-            [rad], both ("decoder") and of "body".
-        witnesses: multipliers of all proofs; a check needs no search.
-    """
-
-    scope: str
+    scope: str  # the environments, and how all of them are covered
+    # Contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z', u and all
+    # e of the scope: the smaller of the next two.
     alpha: float
-    alpha_separate: float
-    alpha_joint: float
-    rho: float
-    beta: float
+    alpha_separate: float  # ρ + β
+    alpha_joint: float  # of z ↦ A(e) z + r(z; u, e) as one map
+    rho: float  # sup_e ||A(e)||
+    beta: float  # Lipschitz constant of r in z
+    # Lipschitz constants of the decoder's outputs "position" [m], "yaw" [rad], both
+    # ("decoder") and of "body".
     lipschitz: dict[str, float]
-    witnesses: dict[str, Any]
+    witnesses: dict[str, Any]  # multipliers of all proofs; a check needs no search
 
 
 def require_claims(claims: Claims, weights: Exported, box: Box) -> None:

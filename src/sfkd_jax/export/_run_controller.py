@@ -75,7 +75,8 @@ class ExportedController:
 
     def init(self, seed: int = 0) -> dict[str, jax.Array]:
         """Return the state before the first step; `seed` determines all samples."""
-        return self._named("init", "state", self._init(self._key(seed)))
+        key = jax.random.key(seed, impl=str(self.manifest["key_implementation"]))
+        return self._named("init", "state", self._init(jax.random.key_data(key)))
 
     def act(
         self,
@@ -138,11 +139,6 @@ class ExportedController:
                 moved: Any = _shifted(info[name], origin)
                 info[name] = moved
         return values[0], state, info
-
-    def _key(self, seed: int) -> jax.Array:
-        """Return the data of a random key."""
-        implementation = str(self.manifest["key_implementation"])
-        return jax.random.key_data(jax.random.key(seed, impl=implementation))
 
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
         """Return the outputs below `root` by name, without the prefix."""

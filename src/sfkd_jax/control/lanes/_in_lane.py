@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from sfkd_jax.control._factory import factory
+from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control.lanes._manoeuvre import Judged, Manoeuvres, Situation
 from sfkd_jax.control.lanes._reference import (
     BEHIND,
@@ -61,7 +61,7 @@ class LaneState(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class InLane:
+class InLane(Stateful):
     """A controller that drives in a lane, round obstacles, or stops before them.
 
     The planner compares references with the one that is committed; the cheapest that is
@@ -107,10 +107,6 @@ class InLane:
 
     def __post_init__(self) -> None:
         check_intervals(self)
-
-    def controller(self) -> Controller:
-        """Return the controller of scenes."""
-        return Controller(self.init, self.act)
 
     def init(self, key: Key) -> LaneState:
         """Return the state before the first control step."""

@@ -74,12 +74,6 @@ def steady_turn(
 
     The unknowns are the relative yaw, the body state without v, and u; e_y and v stay
     as in `start`.
-
-    Args:
-        moved: (ξ, u) -> ξ one step later.
-        start: (ξ, u).
-        derivative: `by_differentiation` or `by_differences`.
-        steps: of Newton's method.
     """
     size = start.shape[0] - 2
     # e_y and v are given: the car is on its path, at the reference speed.

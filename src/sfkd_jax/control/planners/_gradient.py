@@ -17,7 +17,7 @@ from sfkd_jax.control.planners._planner import (
     iterate,
     replace_nonfinite,
 )
-from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Fraction, check_intervals
+from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Fraction
 from sfkd_jax.types import Key, Scalar
 
 
@@ -47,7 +47,6 @@ class GradientPlanner(Planner):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_intervals(self)
         if self.task.constraint is not None:
             raise ValueError(
                 "constraints need a search that ranks by them: mppi or cem"

@@ -19,7 +19,12 @@ from sfkd_jax.control.planners._planner import (
     SearchResult,
     Tuning,
 )
-from sfkd_jax.control.tasks._path_tracking import Cost, StageInputs, check_path
+from sfkd_jax.control.tasks._path_tracking import (
+    Cost,
+    PathTarget,
+    StageInputs,
+    check_path,
+)
 from sfkd_jax.control.tasks._task import (
     PlanningStart,
     RolloutSetup,
@@ -112,13 +117,6 @@ class _LiftedSample(NamedTuple):
     known: Bool[Array, ""]
 
 
-class _LiftedTarget(NamedTuple):
-    """The reference of one step, and its curvature averaged over the step [1/m]."""
-
-    point: Float[Array, "*horizon 4"]
-    curvature: Float[Array, "*horizon"]
-
-
 @dataclass(frozen=True, eq=False)
 class _LiftedTracking:
     """The task of tracking a path with a linear predictor, without limits."""
@@ -148,7 +146,7 @@ class _LiftedTracking:
         # The first step has the curvature of the first point, others that of both ends.
         mean = 0.5 * (curvature[1:] + curvature[:-1])
         over = jnp.concatenate([curvature[:1], mean])
-        targets = _LiftedTarget(reference, over)
+        targets = PathTarget(reference, over, None)
         return RolloutSetup(predictor._replace(lift=None), first, targets, known)
 
     def step(
@@ -157,7 +155,7 @@ class _LiftedTracking:
         predictor: LinearPredictor,
         before: _LiftedSample,
         u: Control,
-        target: _LiftedTarget,
+        target: PathTarget,
         at: StepIndex,
     ) -> StepResult:
         """Return one step of the prediction and its cost."""

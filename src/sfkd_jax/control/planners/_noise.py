@@ -11,13 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.planners._planner import Planner
-from sfkd_jax.ranges import (
-    AtLeastOne,
-    AtLeastTwo,
-    UnitInterval,
-    check_choice,
-    check_intervals,
-)
+from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, UnitInterval, check_choice
 from sfkd_jax.types import Control, Key
 
 Noise: TypeAlias = Float[Array, "horizon sample control"]
@@ -48,7 +42,6 @@ class SamplingPlanner(Planner):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_intervals(self)
         check_choice("noise", self.noise, KINDS)
         if self.noise == "spline" and self.noise_knots > self.horizon:
             raise ValueError(

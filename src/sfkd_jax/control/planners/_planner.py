@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
-from sfkd_jax.ranges import AtLeastOne, Positive
+from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
 from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
@@ -133,19 +133,15 @@ class Planner(Stateful):
     _: KW_ONLY
     horizon: AtLeastOne = 20
     noise_std: tuple[Positive, ...] = (0.02, 0.3)
-    unroll: int = 2
+    unroll: AtLeastOne = 2
     env_low: tuple[float, ...] | None = None
     env_high: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        check_intervals(self)
         shape, std = self.task.low.shape, self.noise_std
-        if shape not in ((), (len(std),)) or not all(entry > 0 for entry in std):
-            raise ValueError(f"noise_std needs a positive number a control, got {std}")
-        if self.horizon < 1 or self.unroll < 1:
-            raise ValueError(
-                "horizon and unroll must be at least 1, "
-                f"got {self.horizon} and {self.unroll}"
-            )
+        if shape not in ((), (len(std),)):
+            raise ValueError(f"noise_std needs a number a control, got {std}")
 
     def search(
         self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate

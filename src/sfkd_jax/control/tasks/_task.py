@@ -105,9 +105,6 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
         high: upper control limits.
         rate: largest change per second, or None for no slew limit.
         dt: sampling period [s].
-
-    Raises:
-        ValueError: the box is empty, the sizes differ, or a rate is not positive.
     """
     if np.shape(low) != np.shape(high) or not np.all(np.less(low, high)):
         raise ValueError(

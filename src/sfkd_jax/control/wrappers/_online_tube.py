@@ -203,11 +203,7 @@ class OnlineTube(Stateful):
 def slow_down(reference: Reference, factor: float | Scalar) -> Reference:
     """Follow the same path at a lower speed, linear between its points.
 
-        g'(t) = g(c t),   v'(t) = c v(c t)
-
-    Args:
-        reference: x, y, yaw, speed of each step.
-        factor: c in (0, 1].
+    g'(t) = g(c t),   v'(t) = c v(c t),   c in (0, 1]
     """
     horizon = reference.shape[0]
     # reference[0] is the target one step from now. The target now is one step back
