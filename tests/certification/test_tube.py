@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, at, certified, driven, jit, model_and_params
+from helpers import certified, driven, jit, model_and_params
 
-from sfkd_jax.certification import certify, latent_tube
+from sfkd_jax.certification import latent_tube
 from sfkd_jax.certification._measured import KINDS, residuals
 from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.geometry import wrap_angle
@@ -19,62 +19,6 @@ from sfkd_jax.rollout import rollout
 def test_the_latent_tube_is_the_closed_formula(alpha, d_bar):
     exact = d_bar * (1 - alpha ** np.arange(1, 41)) / (1 - alpha)
     np.testing.assert_allclose(latent_tube(alpha, d_bar, 40), exact, rtol=1e-12)
-
-
-def scaled_to_the_limit(params):
-    """Operators that are multiples of the identity: ρ acts in every direction, so the
-    tube is nearly reached.
-    """
-    limit = 10.0 * np.tile(np.eye(8, dtype=np.float32), (3, 1, 1))
-    return params | {"networks": params["networks"] | {"operators": limit}}
-
-
-@pytest.mark.parametrize(("aligned", "limit"), [(False, False), (True, True)])
-def test_with_bounded_disturbances_the_tube_is_violated_exactly_never(aligned, limit):
-    """Latents under the same u, switching e and transport; one of them is disturbed
-    by |d| ≤ d̄ at every step.
-    """
-    model, params = model_and_params("sfkd")
-    params = scaled_to_the_limit(params) if limit else params
-    alpha = certify(model, params, (ENV_LOW, ENV_HIGH), attack_starts=0).alpha
-    d_bar, steps, episodes = 0.05, 120, 16
-
-    def episode(params, key):
-        start_key, push_key, env_key, control_key = jax.random.split(key, 4)
-        envs = jnp.asarray([0.6, 0.0]) + jnp.asarray([0.3, 8.0]) * jax.random.uniform(
-            env_key, (steps, 2), minval=-1.0
-        )
-        controls = jnp.asarray([0.3, 3.0]) * jax.random.normal(control_key, (steps, 2))
-        fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, envs)
-        later = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0), fibers)
-        start = model.encode(at(fibers, 0), jnp.asarray([0.0, 0.0, 0.0, 10.0]))
-        start = start._replace(z=jax.random.normal(start_key, (8,)))
-
-        def step(pair, inputs):
-            here, there, control, push = inputs
-            truth, model_latent = (
-                model.transport(here, there, model.step(here, latent, control))
-                for latent in pair
-            )
-            gap = truth.z - model_latent.z
-            direction = gap + 1e-6 * push if aligned else push
-            # |d| stays below d̄ by 1e-4 of it, more than float32 rounds in adding it
-            truth = truth._replace(
-                z=truth.z + d_bar * (1 - 1e-4) * direction / jnp.linalg.norm(direction)
-            )
-            return (truth, model_latent), jnp.linalg.norm(truth.z - model_latent.z)
-
-        pushes = jax.random.normal(push_key, (steps, 8))
-        return jax.lax.scan(step, (start, start), (fibers, later, controls, pushes))[1]
-
-    keys = jax.random.split(jax.random.key(4), episodes)
-    errors = jit(jax.vmap(episode, in_axes=(None, 0)))(params, keys)
-    errors = np.asarray(errors, dtype=np.float64)
-    tube = latent_tube(alpha, d_bar, steps)
-    assert int(np.sum(errors > tube)) == 0
-    if aligned and limit:
-        assert errors.max() > 0.15 * tube[-1]  # the check is not about nothing
-        assert errors[:, :5].max() > 0.7 * tube[4]
 
 
 def test_the_physical_tube_is_its_finite_sums():

@@ -354,7 +354,6 @@ def test_info_has_the_documented_entries_with_the_documented_shapes(name):
     _, _, info = act_once(name)
     assert undocumented(info) == {}
     assert set(info) >= REQUIRED
-    assert info["predicted_states"].shape == (HORIZON, 4)
 
 
 def test_every_documented_entry_is_given_by_a_planner_or_a_wrapper():
