@@ -255,8 +255,8 @@ def _seen(runs_of: Callable[[Key], Trajectory], observe: Any, key: Key) -> Any:
     """Innovations of runs; one in which a simulator failed is another one's again."""
     runs = runs_of(key)
     kept = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
-    rows = np.resize(np.flatnonzero(kept), len(kept))
-    rows = np.where(kept, np.arange(len(kept)), rows)
+    rows = np.resize(np.flatnonzero(kept), len(runs.states))
+    rows = np.where(kept, np.arange(len(rows)), rows)
     return jax.tree.map(lambda leaf: leaf[rows], observe(runs, key))
 
 
