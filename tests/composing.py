@@ -5,7 +5,7 @@ from functools import cache
 from hydra import compose, initialize_config_dir
 
 from sfkd_jax.experiment import command, options
-from sfkd_jax.settings import plain
+from sfkd_jax.store import plain
 
 
 @cache

@@ -25,7 +25,6 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 import sfkd_jax
 from sfkd_jax import build, certification, policy, store
 from sfkd_jax import export as exporting
-from sfkd_jax import settings as parsing
 from sfkd_jax.experiment import runs
 from sfkd_jax.export import __main__ as export
 from sfkd_jax.lanes import Lane, Obstacles
@@ -61,7 +60,7 @@ def exported(tmp_path_factory):
     params = jit(build.build_model(requested.model, space(), plant).init)(
         jax.random.key(0)
     )
-    stored = parsing.plain(requested) | {"space": build.space_to_settings(space())}
+    stored = store.plain(vars(requested) | {"space": space()._asdict()})
     stored["dataset"] |= {"segments": 120, "shares": SHARES}
     runs.claim(requested)
     run_dir = requested.run_dir

@@ -10,7 +10,6 @@ from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.comparing import Comparison
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report.comparison import write_results_page
-from sfkd_jax.settings import plain
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -27,7 +26,7 @@ def run(settings: Settings) -> dict[str, Any]:
         rows, results = table.rows(), table.directory / "results.json"
         document = {
             "rows": rows,
-            "config": plain(settings) | {"command": command_line("compare")},
+            "config": store.plain(settings) | {"command": command_line("compare")},
             "versions": store.versions(),
             "failed": table.failed,
             "seconds": time.perf_counter() - began if done else None,

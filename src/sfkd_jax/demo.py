@@ -13,7 +13,7 @@ from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report.episodes import of_rows
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.tables import text_table
-from sfkd_jax.settings import plain, replace
+from sfkd_jax.settings import replace
 
 SHIPPED = Path(__file__).with_name("pretrained")
 """vehicle, or vehicle_path in path coordinates -> policy.safetensors and its
@@ -42,7 +42,7 @@ def run(settings: Settings) -> dict[str, Any]:
     with store.locked(home):
         found = evaluating.drive(settings, systems, episodes)
         seconds = time.perf_counter() - began
-        results = runs.write_results(home, plain(settings), found, seconds)
+        results = runs.write_results(home, store.plain(settings), found, seconds)
         # The last ones: those of an earlier demo with other settings come before.
         rows = runs.read_results(home)[-len(found) :]
         store.print_message(text_table(rows, *PRINTED))
@@ -64,8 +64,8 @@ def _load(settings: Settings, directory: Path) -> policy.Policy:
         )
     trained = None
     if directory.is_dir():
-        trained = policy.load(directory, controller=plain(settings.controller))
-    if trained is None or trained.settings["vehicle"] != plain(settings.vehicle):
+        trained = policy.load(directory, controller=store.plain(settings.controller))
+    if trained is None or trained.settings["vehicle"] != store.plain(settings.vehicle):
         names = sorted({one.name.split("_")[0] for one in SHIPPED.iterdir()})
         raise ValueError(
             f"controllers ship for {' and '.join(names)} as they are; "

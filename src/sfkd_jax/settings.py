@@ -1,8 +1,8 @@
 """Settings: dataclasses made from the signatures of factories, parsed and checked.
 
 A factory states its settings once, as annotated keyword-only arguments. `takes` makes
-a class a frozen dataclass of them, `parse` an object of plain values (JSON or YAML),
-and `plain` the values again.
+a class a frozen dataclass of them, and `parse` an object of plain values (JSON or
+YAML), which `store.plain` returns again.
 """
 
 from __future__ import annotations
@@ -126,15 +126,6 @@ def parse(kind: type[T], values: Values | T, above: str = "") -> T:
 def replace(settings: T, **changes: Any) -> T:
     """Return settings with changes of some fields, checked as `parse` does."""
     return parse(type(settings), vars(settings) | changes)
-
-
-def plain(settings: Any) -> Any:
-    """Return an object of settings as plain values, with tuples as lists."""
-    if is_dataclass(settings):
-        settings = vars(settings)
-    if isinstance(settings, Mapping):
-        return {name: plain(value) for name, value in settings.items()}
-    return [*map(plain, settings)] if isinstance(settings, list | tuple) else settings
 
 
 @cache

@@ -17,6 +17,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import is_dataclass
 from datetime import UTC, datetime
 from importlib import import_module, metadata
 from pathlib import Path
@@ -125,7 +126,9 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """Convert to JSON types; arrays become lists, NaN and infinities None."""
+    """Convert to JSON types: also arrays and settings; NaN and infinities are None."""
+    if is_dataclass(value):
+        value = vars(value)
     if hasattr(value, "__array__"):
         value = np.asarray(value).tolist()
     if isinstance(value, Mapping):

@@ -11,7 +11,6 @@ from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.report.run import write_report
-from sfkd_jax.settings import plain
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -30,7 +29,8 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     """Run all stages in the run directory."""
     trained, run_dir = stages.ensure_policy(settings), settings.run_dir
     # A policy that exists is not written again, and `load` builds what it says.
-    if store.differences(trained.settings["controller"], plain(settings.controller)):
+    asked = store.plain(settings.controller)
+    if store.differences(trained.settings["controller"], asked):
         store.print_message(
             f"{run_dir}: the policy keeps the controller that it was trained with; "
             "`load(…, controller=…)` takes another"

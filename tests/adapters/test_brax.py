@@ -19,7 +19,7 @@ from sfkd_jax.types import Controller
 STEPS = 25
 CALM = {"scenario": "s1", "duration": STEPS * 0.1}
 GUSTS = {"vehicle": "dynamic", "scenario": "s2", "duration": 6.0}
-adapters.register_brax()
+envs.register_environment("sfkd_vehicle", adapters.BraxVehicle)
 
 
 @cache

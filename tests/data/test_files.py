@@ -386,7 +386,6 @@ def with_commas(text):
 
 RECORDERS = {
     "a mark": lambda text: text.encode("utf-8-sig"),
-    "UTF-16": lambda text: text.encode("utf-16"),
     "Windows-1252": lambda text: text.replace("yaw", "yaw_°").encode("cp1252"),
     "decimal commas": lambda text: with_commas(text).encode(),
     "line ends of Windows": lambda text: text.replace("\n", "\r\n").encode(),
@@ -394,9 +393,6 @@ RECORDERS = {
     "a logger's head": lambda text: f"# logger X1, t in s\n#v 2\n{text}".encode(),
     "a header of numpy": lambda text: f"# {text}".encode(),
     "comments": lambda text: f"# made by us\n{text}# the end\n\n".encode(),
-    "units": lambda text: text.replace(
-        "\n", f"\ns,m,m,rad,m/s{',-' * 4}\n", 1
-    ).encode(),
 }
 
 
@@ -487,7 +483,7 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
     write_csv(tmp_path / "here" / "a.csv", recorded_run(phase=0.1))
     assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
     write_csv(tmp_path / "there" / "twice.csv", recorded_run())
-    assert "twice.csv: the same contents as" in refusal(tmp_path / "there")
+    assert "the same numbers as" in refusal(tmp_path / "there")
 
 
 def elsewhere(columns):
@@ -559,11 +555,6 @@ def test_invalid_columns_are_refused(tmp_path, columns, message):
         (late(("p_x", "p_y"), 1), {}, "behind v is 0.1 s (1 steps of vehicle.dt)"),
         (late(NAMES[1:5], 1), {}, "the lag of v behind acceleration is 0.05 s (0.5"),
         (straight, {}, "yaw turns by 0.014 degrees a second (root"),
-        (
-            straight,
-            {},
-            "steering stays between -0.000229 and 0.000238, and so will the controller",
-        ),
         (scale("steering", np.sign), {}, "steering takes only 2 values"),
         (scale("yaw", lambda yaw: yaw + 1.0), {}, "differ by -1.00 rad throughout"),
         (

@@ -70,16 +70,11 @@ def test_the_environment_covers_its_box(data):
     )  # of 16: friction in quarters x wind in quarters
 
 
-def test_fixed_levels_are_the_benchmarks_own_and_no_key_is_used_twice():
+def test_no_key_is_used_twice():
     plant = plants.kinematic()
-    make = partial(
-        datasets.generate, plant, driver(plant), segments=8, steps=5, fixed_levels=True
-    )
+    make = partial(datasets.generate, plant, driver(plant), segments=8, steps=5)
     with jax.debug_key_reuse(True):
-        data = jax.jit(make)(jax.random.key(0))
-    friction = np.asarray(data.envs)[..., 0]
-    np.testing.assert_array_equal(np.unique(friction[:4]), np.float32([0.9]))
-    assert set(np.unique(friction[4:])) <= set(np.float32([0.7, 0.35]))
+        jax.jit(make)(jax.random.key(0))
 
 
 def test_held_out_runs_meet_the_levels_of_s3_at_random_times():

@@ -10,7 +10,8 @@ from sfkd_jax import build
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.options import parse_settings
 from sfkd_jax.ranges import Bounds, Positive, Span
-from sfkd_jax.settings import arguments, parse, plain, replace, schema
+from sfkd_jax.settings import arguments, parse, replace, schema
+from sfkd_jax.store import plain
 
 OPTIONS = (
     *(f"model={name}" for name in build.MODELS if name != "own"),

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax import BraxVehicle as BraxVehicle
     from sfkd_jax.adapters._brax import brax_plant as brax_plant
-    from sfkd_jax.adapters._brax import register_brax as register_brax
     from sfkd_jax.adapters._commonroad import (
         commonroad_controller as commonroad_controller,
     )
@@ -26,12 +25,7 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
 
 _LAZY = {
-    ("_brax", "brax"): (
-        "BraxPlant",
-        "BraxVehicle",
-        "brax_plant",
-        "register_brax",
-    ),
+    ("_brax", "brax"): ("BraxPlant", "BraxVehicle", "brax_plant"),
     ("_commonroad", "plants"): ("commonroad_controller", "commonroad_vehicle"),
     ("_gymnasium", "gym"): ("GymnasiumLane", "GymnasiumVehicle", "register_gymnasium"),
 }

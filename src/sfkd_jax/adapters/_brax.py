@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax import envs
 from brax.envs.base import Env, PipelineEnv
 from brax.envs.base import State as BraxState
 from brax.generalized import pipeline
@@ -24,7 +23,6 @@ from sfkd_jax.types import (
     Step,
 )
 
-NAME = "sfkd_vehicle"
 SCALED = {
     "gravity": ("gravity", "opt.gravity"),
     "damping": ("dof.damping",),
@@ -33,11 +31,6 @@ SCALED = {
 """Parameters that entries of e may scale, and their fields in a system; damping is the
 viscous friction of all joints.
 """
-
-
-def register_brax(name: str = NAME) -> None:
-    """Register `BraxVehicle` under a name that `brax.envs.create` knows."""
-    envs.register_environment(name, BraxVehicle)
 
 
 class BraxVehicle(Env):

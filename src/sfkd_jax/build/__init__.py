@@ -250,11 +250,6 @@ def _check_law(
         raise ValueError(f"its vehicle.dt = {dt} is not that of its law")
 
 
-def space_to_settings(space: Space) -> dict[str, list[float]]:
-    """Return scales as plain lists, for a manifest."""
-    return {name: scale.tolist() for name, scale in space._asdict().items()}
-
-
 def space_from_settings(settings: Values) -> Space:
     """Return the scales that a manifest holds."""
     # JSON has decimals: as float32 they are the bits that the model was trained with.

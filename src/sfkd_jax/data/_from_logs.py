@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -33,8 +33,8 @@ MOST_LINES = 20
 """Warnings that are reported in full; of more, only their number."""
 ROUNDED = 1e-5
 """How far outside its range a channel may be: float32 rounds."""
-STRAIGHT, TINY = 1.0, 0.01
-"""Yaw rate [degrees/s] and range of a control below which a log teaches too little."""
+STRAIGHT = 1.0
+"""Yaw rate below which a log teaches too little [degrees/s]."""
 ALIKE = 1e-3
 """Of a channel's standard deviation: to this step numbers are rounded and compared."""
 IN_A_ROW = 10
@@ -97,7 +97,7 @@ def from_logs(
     check_choice("dataset.missing", missing, ("refuse", "drop"))
     # All files are read and checked before any is refused: one run shows all faults.
     recorded, errors, conversions = read_logs(
-        log_files(path).values(),
+        [file for _, file in log_files(path)],
         columns,
         dt=dt,
         needs_environment=needs_environment,
@@ -152,9 +152,17 @@ def from_logs(
         )
         for group, (names, values) in groups.items()
     }
-    for line in _coverage_lines(covered):
-        report(line)
+    for group, rows in covered.items():
+        for name, row in rows.items():
+            report(f"coverage of {group} {name}: {_told(row)}")
     return LoggedDataset(dataset, covered)
+
+
+def _told(row: dict[str, float]) -> str:
+    """The coverage of a channel, for a person."""
+    middle = f"middle 99.8 % {row['low_998']:.4g} … {row['high_998']:.4g}"
+    visited = f"{round(10 * row['bins_visited'])} of 10 tenths visited"
+    return f"{row['low']:.4g} … {row['high']:.4g}, {middle}, {visited}"
 
 
 def _repeats(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
@@ -331,14 +339,6 @@ def _commands(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
             f"{_span(logs)}: {yaw} turns by {rate:.2g} degrees a second (root mean "
             "square); record curves, or the model learns none"
         )
-    for k, name in enumerate(controls):
-        values = np.concatenate([log.controls[:, k] for log in logs])
-        low, high = np.quantile(values, [0.001, 0.999])
-        if 0.0 < high - low < TINY:
-            yield warning(
-                f"{_span(logs)}: {name} stays between {low:.3g} and {high:.3g}, and so "
-                "will the controller; vary it more, or set vehicle.control_low and high"
-            )
 
 
 def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
@@ -364,8 +364,8 @@ def _report_findings(findings: list[Finding], report: Callable[[str], None]) -> 
         raise ValueError(f"{refused[0]}{more}")
 
 
-def log_files(path: str) -> dict[str, Path]:
-    """Return the logs of a file, a folder or a glob by the hash of their contents.
+def log_files(path: str) -> list[tuple[str, Path]]:
+    """Return the logs of a file, a folder or a glob, after the hash of their contents.
 
     They are in the order of the hashes: a data set does not depend on names of files.
     """
@@ -387,23 +387,20 @@ def log_files(path: str) -> dict[str, Path]:
         files = [file for file in map(Path, named) if file.is_file()]
     if not files:
         raise ValueError(f"{path}: {absent}")
-    found: dict[str, Path] = {}
+    found: list[tuple[str, Path]] = []
     for file in sorted(files):
         if file.suffix.lower() not in SUFFIXES:
             raise ValueError(f"{file}: unknown kind of log; choose one of {known}")
         status = file.stat()
         digest = _digest(file.resolve(), status.st_size, status.st_mtime_ns)
-        if (same := found.setdefault(digest, file)) != file:
-            raise ValueError(
-                f"{file}: the same contents as {same}; remove one of them, "
-                "or test runs are trained on"
-            )
-    return dict(sorted(found.items()))
+        found.append((digest, file))
+    return sorted(found)
 
 
 def fingerprint(path: str) -> str:
     """Return a hash of the contents of all logs of a path, whatever their names."""
-    return hashlib.sha256("".join(log_files(path)).encode()).hexdigest()
+    digests = (digest for digest, _ in log_files(path))
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 @cache
@@ -412,19 +409,3 @@ def _digest(file: Path, size: int, written: int) -> str:
     del size, written  # part of the key of the cache
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()  # pyright: ignore
-
-
-def _coverage_lines(
-    groups: Mapping[str, Mapping[str, Mapping[str, float]]],
-) -> Iterator[str]:
-    """The lines of a table of coverage, one per channel."""
-    yield (
-        f"{'coverage':28}{'lowest':>11}{'highest':>11}{'middle 99.8 %':>24}"
-        f"{'tenths visited':>16}"
-    )
-    for group, rows in groups.items():
-        for name, row in rows.items():
-            middle = f"{row['low_998']:.4g} … {row['high_998']:.4g}"
-            ends = f"{row['low']:11.4g}{row['high']:11.4g}"
-            visited = f"{round(10 * row['bins_visited']):>13}/10"
-            yield f"{f'{group}: {name}':28}{ends}{middle:>24}{visited}"

@@ -78,7 +78,6 @@ def generate(
     speed: Span = (7.0, 13.0),
     steering_excitation: Span = (0.005, 0.1),
     speed_excitation: Span = (0.1, 1.5),
-    fixed_levels: bool = False,
     held_out: bool = False,
     env_low: tuple[float, ...] = BOX[0],
     env_high: tuple[float, ...] = BOX[1],
@@ -96,8 +95,6 @@ def generate(
         speed: range of the target speed [m/s].
         steering_excitation: range of the spread [rad].
         speed_excitation: the same for the second control [m/s² or m/s].
-        fixed_levels: use the levels of the benchmark's S1 and S2 only (the training
-            set as printed in the paper).
         held_out: whether e follows S3 from a random time instead, for tests.
         env_low: lower corner of E, which the levels are moved into by `in_box`.
         env_high: upper corner of E.
@@ -107,13 +104,8 @@ def generate(
         those of `segment_scenarios`.
     """
     excitation = jnp.asarray([steering_excitation, speed_excitation])
-    schedules = _schedules(
-        steps, vehicle.dt, env_low, env_high, fixed_levels=fixed_levels
-    )
-    planned = _planned(key, schedules, _counts(segments, along_path=False))
-    if held_out:
-        s3 = from_s3(steps, vehicle.dt, env_low, env_high)
-        planned = [(s3, jax.random.split(key, segments))]
+    schedules = _schedules(steps, vehicle.dt, env_low, env_high)
+    planned = _planned(key, schedules, segments, held_out=held_out)
     parts = [
         jax.lax.map(
             partial(_segment, vehicle, driver, conditions, steps, speed, excitation),
@@ -167,10 +159,7 @@ def generate_along_path(
         random_switching, dt=loop.dt, dwell=SWITCHES, **box
     )
     env_key, run_key = jax.random.split(key)
-    planned = _planned(env_key, schedules, _counts(segments, along_path=True))
-    if held_out:
-        s3 = from_s3(steps, loop.dt, env_low, env_high)
-        planned = [(s3, jax.random.split(env_key, segments))]
+    planned = _planned(env_key, schedules, segments, held_out=held_out)
     envs = [jax.vmap(conditions)(keys) for conditions, keys in planned]
     return drive_along_path(
         loop,
@@ -194,11 +183,10 @@ def generate_open_loop(
     vehicle: Vehicle,
     key: Key,
     *,
-    segments: int = 4000,
-    steps: int = 50,
     speed: Span,
     lateral_acceleration: Positive,
-    sharpest: Positive = 0.25,
+    segments: int = 4000,
+    steps: int = 50,
     env_low: tuple[float, ...],
     env_high: tuple[float, ...],
 ) -> Trajectory:
@@ -210,11 +198,10 @@ def generate_open_loop(
     Args:
         vehicle: the plant.
         key: consumed.
+        speed: range of the speeds [m/s].
+        lateral_acceleration: of the tightest circles [m/s²], within 0.25 /m.
         segments: number of them.
         steps: of a segment.
-        speed: range of the speeds [m/s].
-        lateral_acceleration: of the tightest circles [m/s²].
-        sharpest: largest curvature [1/m].
         env_low: lower corner of E.
         env_high: upper corner of E.
     """
@@ -230,7 +217,7 @@ def generate_open_loop(
         # Squared: most turns are wide, as on roads, and some as tight as the axes of a
         # law are long.
         share = jax.random.uniform(bend_key, (), minval=-1.0)
-        tightest = jnp.minimum(lateral_acceleration / begin**2, sharpest)
+        tightest = jnp.minimum(lateral_acceleration / begin**2, 0.25)
         steering = jnp.arctan(vehicle.wheelbase * share * jnp.abs(share) * tightest)
         spread = _log_uniform(spread_key, spreads)
         white = jax.random.normal(noise_key, (steps + SETTLING, 2))
@@ -276,18 +263,17 @@ def _counts(segments: int, *, along_path: bool) -> dict[str, int]:
     return dict(zip(SCENARIOS, sizes, strict=False))
 
 
-def _schedules(
-    steps: int, dt: float, *box: tuple[float, ...], fixed_levels: bool = False
-) -> dict[str, Conditions]:
-    """Uniform and wet roads; friction drops at a random time of the segment."""
-    dry: dict[str, Any] = {} if fixed_levels else {"friction": (0.3, 0.9)}
-    wet: dict[str, Any] = {} if fixed_levels else WET
+def _schedules(steps: int, dt: float, *box: tuple[float, ...]) -> dict[str, Conditions]:
+    """Uniform and wet roads, where friction drops at a random time, and S3."""
     drop = (0.0, steps * dt)
     return {
-        "uniform": lambda key: in_box(uniform_road(key, steps=steps, **dry), *box),
-        "wet": lambda key: in_box(
-            wet_road(key, steps=steps, dt=dt, drop_time=drop, **wet), *box
+        "uniform": lambda key: in_box(
+            uniform_road(key, steps=steps, friction=(0.3, 0.9)), *box
         ),
+        "wet": lambda key: in_box(
+            wet_road(key, steps=steps, dt=dt, drop_time=drop, **WET), *box
+        ),
+        "s3": from_s3(steps, dt, *box),
     }
 
 
@@ -311,9 +297,12 @@ def from_s3(
 
 
 def _planned(
-    key: Key, schedules: dict[str, Conditions], counts: dict[str, int]
+    key: Key, schedules: dict[str, Conditions], segments: int, *, held_out: bool
 ) -> list[tuple[Conditions, Array]]:
-    """The schedule of every scenario, and a key for each of its segments."""
+    """The schedule of every scenario, or S3, and a key for each of its segments."""
+    if held_out:
+        return [(schedules["s3"], jax.random.split(key, segments))]
+    counts = _counts(segments, along_path="held" in schedules)
     return [
         (schedules[name], jax.random.split(jax.random.fold_in(key, index), count))
         for index, (name, count) in enumerate(counts.items())

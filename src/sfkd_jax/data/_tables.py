@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import io
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -119,10 +118,10 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
     """Read the configured columns of a csv file.
 
     Cells are separated by commas, semicolons, tabs or blanks; # begins a comment. Lines
-    before the header are skipped, a line of units below it is added to the names.
+    before the header are skipped.
 
     Args:
-        file: as UTF-8, UTF-16 with its mark, or else Windows-1252.
+        file: as UTF-8, or else Windows-1252.
         wanted: names of columns; the header is the line that has most of them.
         blanks: whether empty cells are NaN; otherwise they are text.
     """
@@ -139,8 +138,6 @@ def read_csv(file: Path, wanted: Collection[str], *, blanks: bool = False) -> Ta
     if twice := [name for k, name in enumerate(names) if name in names[:k]]:
         raise ValueError(f"{where}: the column {twice[0]} appears twice")
     kept = [k for k in filled if k > header and not lines[k].startswith("#")]
-    if kept and (units := _with_units(names, _cells(lines[kept[0]], between)[0])):
-        names, kept = units, kept[1:]
     if not kept:
         raise ValueError(f"{file}: no rows below the header")
     rows = np.array(kept) + 1
@@ -214,16 +211,14 @@ def _header(
 
 def among(headers: Iterable[str], wanted: Collection[str]) -> list[str]:
     """Those headers that are a configured name, with or without a unit behind it."""
-    return [one for one in headers if one in wanted or name_of(one) in wanted]
+    return [one for one in headers if one in wanted or split_unit(one)[0] in wanted]
 
 
 def _text(file: Path) -> str:
-    """The text of a file, by its byte order mark, as UTF-8, or else Windows-1252."""
-    content, encoding = read_bytes(file), "utf-8-sig"
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
+    """The text of a file as UTF-8, or else Windows-1252."""
+    content = read_bytes(file)
     try:
-        text = content.decode(encoding)
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         # Recorders on Windows write the degree sign as one byte.
         text = content.decode("cp1252", errors="replace")
@@ -295,7 +290,7 @@ def find_column(
     """
     exact, fitting = name in headers, [name]
     if not exact:
-        fitting = [one for one in headers if name_of(one) == name != one.strip()]
+        fitting = [one for one in headers if split_unit(one)[0] == name != one.strip()]
     if len(fitting) > 1:
         raise ValueError(
             f"columns {' and '.join(fitting)} both fit {name}; configure one in full"
@@ -362,24 +357,3 @@ def split_unit(header: str) -> tuple[str, str | None]:
         return header, None
     name, round_, square = parts.groups()
     return name, (round_ if square is None else square).strip()
-
-
-def name_of(header: str) -> str:
-    """Return the name of a column without its unit."""
-    return split_unit(header)[0]
-
-
-def _with_units(names: list[str], cells: list[str]) -> list[str] | None:
-    """Names with the units of the line below them; None if that line has none."""
-    symbols = [cell.strip("()[] ") for cell in cells]
-    # A row of data has numbers; "1" and "-" alone do not make a line of units.
-    if len(cells) != len(names) or any(symbol[:1].isdigit() for symbol in symbols):
-        return None
-    if not all(symbol == "" or find_unit(symbol) for symbol in symbols):
-        return None
-    if not any(symbol.strip("-") for symbol in symbols):
-        return None
-    return [
-        f"{name} [{symbol}]" if symbol and split_unit(name)[1] is None else name
-        for name, symbol in zip(names, symbols, strict=True)
-    ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import command, evaluating, runs, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
-from sfkd_jax.settings import plain, replace
+from sfkd_jax.settings import replace
 from sfkd_jax.training import TrainingStopped
 
 OF_A_ROW = (TrainingStopped, ValueError, store.ArtefactError, JaxRuntimeError)
@@ -113,7 +112,7 @@ def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
 def settings_hash(settings: Settings) -> str:
     """Hash the settings that the result of a cell depends on, not the code."""
     names = ("environment", "controller", "scenario", "certification", "evaluation")
-    chosen = {name: plain(getattr(settings, name)) for name in names}
+    chosen = {name: getattr(settings, name) for name in names}
     return store.sha256(runs.identity(settings) | chosen)
 
 
@@ -124,7 +123,7 @@ def episodes_hash(settings: Settings) -> str:
     """
     protocol = settings.evaluation
     counts = protocol.seed, protocol.episodes, protocol.episode_s
-    return store.sha256([*counts, plain(settings.vehicle), plain(settings.scenario)])
+    return store.sha256([*counts, settings.vehicle, settings.scenario])
 
 
 def is_done(path: Path, settings: Settings) -> bool:
@@ -210,7 +209,7 @@ class Comparison:
 
     def evaluate(self) -> int:
         """Evaluate all cells that are not done, and return how many there were."""
-        began, done = time.perf_counter(), 0
+        done = 0
         share = self._settings.comparison.share
         groups = take_share(group_cells(self.cells), share)
         # Every row is built before the first one is trained.
@@ -218,16 +217,9 @@ class Comparison:
             with self._named_if_it_fails(group):
                 self._check(group)
         groups = [group for group in groups if _name(group) not in self.failed]
-        for number, group in enumerate(groups, 1):
+        for group in groups:
             with self._named_if_it_fails(group):
                 done += self._evaluate(group)
-            if done:
-                seconds = time.perf_counter() - began
-                left = seconds / number * (len(groups) - number)
-                store.print_message(
-                    f"[{number}/{len(groups)}] {seconds / 60:.0f} min so far, "
-                    f"about {left / 60:.0f} min left"
-                )
         return done
 
     def rows(self) -> list[Row]:
@@ -313,7 +305,7 @@ class Comparison:
         """The episodes of a cell; rows that are compared share them."""
         # Not the controller: rows are paired because they meet the same episodes.
         parts = (settings.vehicle, settings.scenario, settings.environment)
-        key = store.sha256(plain([*parts, settings.evaluation]))
+        key = store.sha256([*parts, settings.evaluation])
         if key not in self._episodes:
             self._episodes[key] = evaluating.make_episodes(settings)
         return self._episodes[key]

@@ -36,7 +36,7 @@ from sfkd_jax.data import (
 from sfkd_jax.experiment.options import LogSettings, Settings
 from sfkd_jax.models import one_step
 from sfkd_jax.plants import Vehicle, check_step
-from sfkd_jax.settings import arguments, plain, replace
+from sfkd_jax.settings import arguments
 from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import BODY, Key, Model, Step, Trajectory
 
@@ -53,31 +53,21 @@ REGRESSION = 16_000
 
 def config(settings: Settings) -> dict[str, Any]:
     """Return what the data set of a run depends on; runs of equal values share it."""
-    dataset, environment = plain(settings.dataset), settings.environment
+    dataset, environment = store.plain(settings.dataset), settings.environment
     if logs := settings.logs:
         # Contents instead of the path: the same logs elsewhere make the same data set.
         del dataset["path"]
         dataset["contents"] = fingerprint(logs.path)
         dataset["environment_known"] = environment.is_known
-    return {
-        "vehicle": plain(settings.vehicle),
-        "environment": {"low": plain(environment.low), "high": plain(environment.high)},
-        "dataset": dataset,
-    }
+    box = {"low": environment.low, "high": environment.high}
+    about = {"vehicle": settings.vehicle, "environment": box, "dataset": dataset}
+    return store.plain(about)
 
 
 def dataset_path(settings: Settings) -> Path:
     """Return the path of the data set of a run."""
     name = f"{settings.vehicle.name}-{store.sha256(config(settings))[:8]}"
     return Path(settings.root) / "datasets" / name / "dataset.safetensors"
-
-
-def column_names(settings: Settings) -> dict[str, list[str]]:
-    """Return the columns of the logs by box; an unused environment has none."""
-    named = settings.logs.columns if settings.logs else Columns()
-    env = named.environment if settings.environment.is_known else ()
-    columns = {"state": named.state[BODY], "control": named.control, "env": env}
-    return {box: list(names) for box, names in columns.items()}
 
 
 def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
@@ -226,13 +216,6 @@ def ensure_law(settings: Settings) -> PathLaw | None:
     return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
 
 
-def with_law_of(settings: Settings, model: str) -> Settings:
-    """Return settings along a path whose law is derived from another model."""
-    dataset: Any = settings.dataset
-    law = replace(dataset.law, model=model)
-    return replace(settings, dataset=replace(dataset, law=law))
-
-
 def derive_law(settings: Settings) -> PathLaw:
     """Derive the law of the data set from the model that its settings name.
 
@@ -354,9 +337,7 @@ def _step_of(model: Model, params: Any) -> Step:
 
 def closed_loop(settings: Settings) -> Vehicle:
     """Return the closed loop of vehicle and law, in path coordinates."""
-    law = ensure_law(settings)
-    if law is None:
-        raise ValueError("a loop along a path needs dataset=path")
+    law: Any = ensure_law(settings)
     return build.build_loop(build.build_vehicle(settings.vehicle), law)
 
 

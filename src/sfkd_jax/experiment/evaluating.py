@@ -22,8 +22,8 @@ from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, unfold
-from sfkd_jax.scenarios import CAR, ROADS, Scenario
-from sfkd_jax.settings import arguments, choose, plain
+from sfkd_jax.scenarios import CAR, COURSES, Scenario
+from sfkd_jax.settings import arguments, choose, replace
 from sfkd_jax.types import Controller, Key
 
 
@@ -120,8 +120,9 @@ def load_systems(settings: Settings) -> dict[str, System]:
         if name == "self":
             systems[settings.model.system] = _policy_system(settings)
             continue
-        if settings.along_path and (whose := build.LAWS_ALONE.get(name)):
-            law = data.ensure_law(data.with_law_of(settings, whose))
+        if (along := settings.along_path) and (whose := build.LAWS_ALONE.get(name)):
+            along = replace(along, law=replace(along.law, model=whose))
+            law = data.ensure_law(replace(settings, dataset=along))
             references[name] = build.reference_systems(plant, law)["law"]
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
@@ -216,7 +217,7 @@ class SystemEvaluation:
 
 def has_course(settings: Settings) -> bool:
     """Whether there are obstacles on the road, and scenes in place of references."""
-    return ROADS[settings.scenario.name].course is not None
+    return settings.scenario.name in COURSES
 
 
 def _in_lane(
@@ -274,7 +275,7 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     compared = load_systems(settings)
     found = drive(settings, compared, episodes)
     seconds = time.perf_counter() - began
-    config = plain(settings) | ({"command": command} if command else {})
+    config = store.plain(settings) | ({"command": command} if command else {})
     return runs.write_results(settings.run_dir, config, found, seconds)
 
 

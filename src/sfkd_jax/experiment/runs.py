@@ -14,7 +14,6 @@ from sfkd_jax.data import Dataset
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.settings import plain
 
 IDENTITY = ("vehicle", "environment", "dataset", "model", "training", "seed")
 """Settings that determine the weights of a run; of the environment, its box."""
@@ -27,8 +26,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 def identity(settings: Settings) -> dict[str, Any]:
     """Return the settings that determine the weights of a run, as plain values."""
     return data.config(settings) | {
-        "model": plain(settings.model),
-        "training": plain(settings.training),
+        "model": store.plain(settings.model),
+        "training": store.plain(settings.training),
         "seed": settings.seed,
     }
 
@@ -66,7 +65,7 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
     Those of logged data include E, and the limits of controls unless they were given.
     """
     recorded = identity(settings) | {
-        "controller": plain(settings.controller),
+        "controller": store.plain(settings.controller),
         "experiment": settings.name,
     }
     if settings.environment.names:

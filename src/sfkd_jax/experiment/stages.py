@@ -30,9 +30,9 @@ from sfkd_jax.models import physics
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
-from sfkd_jax.settings import arguments, choose, plain
-from sfkd_jax.training import Loss, fit, multi_step_loss
-from sfkd_jax.types import Model, Params, Space, Trajectory
+from sfkd_jax.settings import arguments, choose
+from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
@@ -138,6 +138,8 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         ranges = (f"{name} from {low:g} to {high:g}" for name, low, high in box)
         store.print_message(f"the model reads e: {', '.join(ranges)}")
     loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
+    # Fixed windows: validation losses at different steps are comparable.
+    held_out = spread_windows(dataset.validation, length=options.window)
     key, best = jax.random.fold_in(jax.random.key(settings.seed), 0), None
     if model.fitting.identify is not None:
         store.print_message(f"identifying {settings.model.system} in {run_dir}")
@@ -151,18 +153,22 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
             loss,
             partial(random_windows, batch=options.batch, length=options.window),
             dataset.train,
-            # Fixed windows: validation losses at different steps are comparable.
-            spread_windows(dataset.validation, length=options.window),
+            held_out,
             key,
             run_dir,
             inspect=partial(contraction_metrics, model),
             **arguments(options, fit),
         )
     document = _open_loop_document(settings, model, params, dataset)
-    score = _validation_score(loss, params, dataset, options.window)
-    document["validation_score"] = score
+    scores = np.asarray(loss.validate(params, held_out)[2])
+    if dataset.scenarios is not None:
+        wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
+        rows = np.isin(dataset.scenarios["validation"], wanted)
+        # Several windows of every run, of one position in all runs after another.
+        scores = scores.reshape(-1, rows.size)[:, rows]
+    document["validation_score"] = float(scores.mean())
     store.write_json(run_dir / "open_loop.json", document)
-    recorded |= {"space": build.space_to_settings(space), "best_step": best}
+    recorded |= {"space": space._asdict(), "best_step": best}
     policy.save(
         settings.policy_path,
         params,
@@ -215,21 +221,6 @@ def _open_loop_document(
     }
 
 
-def _validation_score(
-    loss: Loss, params: Params, dataset: Dataset, window: int
-) -> float:
-    """Prediction loss on validation runs of S1 and S2, or on all recorded ones."""
-    # The program and the windows of the training's own validation.
-    held_out = spread_windows(dataset.validation, length=window)
-    scores = np.asarray(loss.validate(params, held_out)[2])
-    if dataset.scenarios is None:
-        return float(scores.mean())
-    wanted = [SCENARIOS.index(name) for name in SCORED_SCENARIOS]
-    rows = np.isin(dataset.scenarios["validation"], wanted)
-    # Several windows of every run, of one position in all runs after another.
-    return float(scores.reshape(-1, rows.size)[:, rows].mean())
-
-
 def certify_policy(settings: Settings) -> dict[str, Any]:
     """Certify the policy of the run, and write and return the document.
 
@@ -267,7 +258,7 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
 
 def _asked_for(settings: Settings) -> dict[str, Any]:
     """The settings of the certification that a certificate records."""
-    asked = plain(settings.certification)
+    asked = store.plain(settings.certification)
     # `renew` says what to do, not what is claimed.
     return {name: value for name, value in asked.items() if name != "renew"}
 
@@ -278,7 +269,10 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
     dataset, _ = data.ensure_dataset(settings)
     boxes: dict[str, Any] = data.boxes(dataset)
     if settings.logs:
-        boxes |= {"names": data.column_names(settings)}
+        named = settings.logs.columns
+        env = named.environment if settings.environment.is_known else ()
+        names = {"state": named.state[BODY], "control": named.control, "env": env}
+        boxes |= {"names": store.plain(names)}
     document = issue(
         trained.model,
         trained.params,
@@ -302,7 +296,7 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
         document["corridor"] = certify_corridor(
             loop,
             document["outputs"],
-            plain(settings.dataset) | settings.environment.box,
+            store.plain(settings.dataset) | settings.environment.box,
             options.level,
             **arguments(options.corridor, certify_corridor),
         )

@@ -9,7 +9,7 @@ from sfkd_jax.experiment import runs
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.export import write_controller
-from sfkd_jax.settings import arguments, plain
+from sfkd_jax.settings import arguments
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def run(settings: Settings) -> dict[str, Any]:
         # The weights of the run, the controller of this command.
         trained = policy.load(
             run_dir,
-            controller=plain(settings.controller),
+            controller=store.plain(settings.controller),
             env_source=settings.environment.source,
         )
         # Not refused: a controller without a certificate drives as well.

@@ -14,6 +14,8 @@ from sfkd_jax.types import Key, Scalar, State
 
 FIRST = 70.0
 """Arc length of the first obstacle at the earliest [m]: out of sight at the start."""
+GAP = (40.0, 60.0)
+"""Range of the distance from one obstacle to the next [m]."""
 PASSED = 15.0
 """Distance behind the car at which an obstacle is out of its way [m]."""
 CAR = (2.25, 1.0)
@@ -38,42 +40,27 @@ class Course(NamedTuple):
     view: Float[Array, " obstacle"]
 
 
-def random_course(
-    key: Key,
-    path: Path,
-    *,
-    gap: tuple[float, float] = (40.0, 60.0),
-    offset: float = 1.5,
-    radius: float = 0.8,
-    view: float = 60.0,
-    width: float = 10.5,
-    speed: float = 10.0,
-) -> Course:
-    """Draw obstacles that stand beside or on the centre line of a path.
+def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
+    """Draw obstacles up to 1.5 m beside a path, of radius 0.8 m, seen from 60 m on.
 
     The lane is as wide as three, so that the car may pass each of them on either side.
 
     Args:
         key: consumed.
         path: open; its last 50 m stay free.
-        gap: range of the distance from one obstacle to the next [m].
-        offset: largest, to the left or right [m].
-        radius: of each [m].
-        view: distance from which each is seen [m].
-        width: of the lane [m].
         speed: wanted [m/s].
     """
     gap_key, offset_key = jax.random.split(key)
     length = (path.points.shape[0] - 1) * SPACING
     # As many as the shortest gaps need, and no less than are shown at once.
-    count = max(int((length - FIRST) / gap[0]), IN_VIEW)
-    gaps = jax.random.uniform(gap_key, (count,), minval=gap[0], maxval=gap[1])
-    along = FIRST - gap[0] + jnp.cumsum(gaps)
-    aside = jax.random.uniform(offset_key, (count,), minval=-offset, maxval=offset)
-    obstacles = circles(beside(path, along, aside), radius)
+    count = max(int((length - FIRST) / GAP[0]), IN_VIEW)
+    gaps = jax.random.uniform(gap_key, (count,), minval=GAP[0], maxval=GAP[1])
+    along = FIRST - GAP[0] + jnp.cumsum(gaps)
+    aside = jax.random.uniform(offset_key, (count,), minval=-1.5, maxval=1.5)
+    obstacles = circles(beside(path, along, aside), 0.8)
     obstacles = obstacles._replace(present=along <= path.length - 50.0)
-    lane = lane_along(path, width=width, speed=speed)
-    return Course(lane, obstacles, along, jnp.full(count, view))
+    lane = lane_along(path, width=10.5, speed=speed)
+    return Course(lane, obstacles, along, jnp.full(count, 60.0))
 
 
 def beside(

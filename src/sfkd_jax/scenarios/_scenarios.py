@@ -48,33 +48,15 @@ class Scenario(NamedTuple):
 Family: TypeAlias = Callable[[Key], Scenario]
 
 
-class Road(NamedTuple):
-    """What a scenario is by name: an environment, and obstacles or none.
-
-    Attributes:
-        conditions: (key, steps, sampling period [s]) -> e_0 … e_{T-1}.
-        course: (key, path, speed=v [m/s]) -> obstacles on the path; None for a road
-            that is free.
-    """
-
-    conditions: Callable[[Key, int, float], Schedule]
-    course: Callable[..., Course] | None = None
-
-
-ROADS: dict[str, Road] = {
-    "s1": Road(lambda key, steps, dt: uniform_road(key, steps=steps)),
-    "s2": Road(lambda key, steps, dt: wet_road(key, steps=steps, dt=dt)),
-    "s3": Road(lambda key, steps, dt: switching_road(key, steps=steps, dt=dt)),
-    "obstacles": Road(
-        lambda key, steps, dt: switching_road(key, steps=steps, dt=dt),
-        course=random_course,
-    ),
+ROADS: dict[str, Callable[..., Schedule]] = {
+    "s1": lambda key, steps, dt: uniform_road(key, steps=steps),
+    "s2": wet_road,
+    "s3": switching_road,
+    "obstacles": switching_road,
 }
-"""Scenarios by name; an entry is all that a new one needs.
-
-"s1" is a uniform road, "s2" a wet road with gusts, "s3" a switching road.
-"obstacles" is S3 with a `random_course`.
-"""
+"""Scenarios by name -> (key, steps=, dt=sampling period [s]) -> e_0 … e_{T-1}."""
+COURSES: dict[str, Callable[..., Course]] = {"obstacles": random_course}
+"""Those with obstacles -> (key, path, speed=v [m/s]) -> obstacles on the path."""
 
 
 def scenario(
@@ -116,9 +98,10 @@ def scenario(
         )
 
     def conditions(key: Key) -> Float[Array, "time environment"]:
-        return in_box(road.conditions(key, steps, dt), env_low, env_high)
+        return in_box(road(key, steps=steps, dt=dt), env_low, env_high)
 
-    course = road.course and partial(road.course, speed=speed)
+    course = COURSES.get(name)
+    course = course and partial(course, speed=speed)
     return family(conditions, path, course, speed=speed, state_size=state_size)
 
 
