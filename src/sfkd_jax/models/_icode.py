@@ -6,38 +6,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.models._continuous import Conditioned, Rates, continuous, mlp
 from sfkd_jax.ranges import check_choice
 from sfkd_jax.types import Control, Key, Model, Params, Space, State, Step
-
-
-@jax.custom_jvp
-def softplus(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Return log(1 + exp x), four times as fast as with `log1p`.
-
-    `log1p` branches for each element, and rollouts spend most of their time there. With
-    t = exp −|x| in (0, 1], log(1 + t) = 2 artanh(t / (2 + t)), whose argument is at
-    most 1/3: seven terms of the series leave 2e-8, less than float32 resolves.
-    """
-    # exp of −|x| cannot overflow; exp of x would above 88 in float32.
-    t = jnp.exp(-jnp.abs(x))
-    s = t / (2.0 + t)
-    series = jnp.full_like(s, 1 / 13)
-    # Horner from the smallest term on: no powers, little rounding.
-    for odd in (11, 9, 7, 5, 3, 1):
-        series = 1 / odd + s * s * series
-    return jnp.maximum(x, 0.0) + 2.0 * s * series
-
-
-@softplus.defjvp
-def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # The exact derivative, cheaper and more accurate than that of the series.
-    return softplus(*primals), nn.sigmoid(*primals) * tangents[0]
-
 
 AFFINE_IN = ("both", "env", "control")
 
@@ -121,7 +95,7 @@ def icode(
     Source: Li et al., arXiv 2411.13914.
     """
     # A tanh first, as published: it bounds what the unbounded softplus layers read.
-    activations = (nn.tanh, *(softplus,) * (layers - 1))
+    activations = (nn.tanh, *(nn.softplus,) * (layers - 1))
     rates = affine_rates(
         space, (width,) * layers, activations, last=0.1, affine_in=affine_in
     )
@@ -162,7 +136,7 @@ def icode_mppi(
     """
     # 1e-3, not 0.1: the known dynamics are good already, and noise would spoil them.
     rates = affine_rates(
-        space, hidden, (softplus,) * len(hidden), last=1e-3, affine_in=affine_in
+        space, hidden, (nn.softplus,) * len(hidden), last=1e-3, affine_in=affine_in
     )
 
     def known(fiber: Conditioned, state: State, control: Control) -> State:
