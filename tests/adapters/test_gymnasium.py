@@ -104,7 +104,5 @@ def test_it_refuses_bad_settings_and_a_forked_process(monkeypatch):
     monkeypatch.setattr("os.getpid", lambda: 0)
     with pytest.raises(RuntimeError, match=r'vector_kwargs=\{"context": "spawn"\}'):
         inside.reset(seed=0)
-    with pytest.raises(ValueError, match="unknown scenario 's9'; choose one of"):
-        gymnasium.make("sfkd_jax/Vehicle-v0", scenario="s9")
     with pytest.raises(ValueError, match="render_mode must be rgb_array"):
         adapters.GymnasiumVehicle(render_mode="ansi")

@@ -51,12 +51,6 @@ def test_every_trajectory_is_assigned_exactly_once(shares):
     np.testing.assert_array_equal(np.asarray(part.states)[:, :-1, :2], part.controls)
 
 
-def test_the_split_is_shuffled_by_its_key():
-    orders = [members(split(numbered(43), seed).train) for seed in (0, 0, 1)]
-    assert orders[0] == orders[1] != orders[2]
-    assert orders[0] != sorted(orders[0])
-
-
 @pytest.mark.parametrize(
     ("count", "shares", "message"),
     [
