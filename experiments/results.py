@@ -28,27 +28,11 @@ VEHICLES = {
     "kinematic_stiff": "stiff kinematic",
     "dynamic": "dynamic",
 }
-LABELS = {
-    "sfkd": "SFKD",
+LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
     "sfkd_no_fiber": "SFKD without e (− fiber)",
-    "sfkd_no_transport": "SFKD − transport",
-    "sfkd_no_residual": "SFKD − residual",
-    "sfkd_no_contraction": "SFKD − contraction",
-    "sfkd_soft": "SFKD, soft hinge",
-    "koopman_mpc": "Koopman MPC",
-    "neural_ode": "Neural ODE",
-    "icode": "ICODE",
     "icode_extrinsic": "ICODE, e extrinsic",
-    "control_synth": "ControlSynth",
-    "icode_mppi": "ICODE-MPPI",
     "icode_mppi_extrinsic": "ICODE-MPPI, e extrinsic",
-    "icode_mppi_reads_env": "ICODE-MPPI, reads e",
-    "icode_mppi_one_step": "ICODE-MPPI, one step",
-    "law": "Law alone",
-    "law_nominal": "Law alone, of the nominal bicycle",
-    "law_plant": "Law alone, of the true plant",
     "nominal": "Nominal bicycle",
-    "oracle": "Oracle",
 }
 """Row of a comparison -> its name in a table, in the order of the tables."""
 LEVEL = 0.05

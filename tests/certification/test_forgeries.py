@@ -137,12 +137,6 @@ def test_a_spoiled_witness_proves_nothing(name, factor):
     refuted(changed, NETWORK, "does not follow from its witness")
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 4])
-def test_a_witness_is_needed_for_every_vertex(count):
-    joint = (2 * honest().witnesses["joint"])[:count]
-    refuted(witness(honest(), joint=joint), NETWORK, "alpha_joint does not follow")
-
-
 def test_weights_that_moved_are_others():
     moved = NETWORK._replace(residual=(FIRST, 1.1 * LAST))
     refuted(honest(), moved, "beta does not follow")

@@ -49,16 +49,16 @@ SYSTEMS = {
     "icode_extrinsic": Look("ICODE, f(s, u) + G(s, u) e", "#2b83ba", (3, 1)),
     "control_synth": Look("ControlSynth", "#cc79a7", _RIVAL),
     "icode_mppi": Look("ICODE-MPPI", "#d55e00", _RIVAL),
-    "icode_mppi_one_step": Look("ICODE-MPPI, one step", "#8c510a", (1, 1)),
-    "icode_mppi_reads_env": Look("ICODE-MPPI, reads e", "#b8860b", (3, 1)),
     "icode_mppi_extrinsic": Look(
         "ICODE-MPPI, f(s, u) + G(s, u) e", "#a63603", (1, 1, 3, 1)
     ),
-    "nominal": Look("Nominal", SECOND, width=1.4),
-    "oracle": Look("Oracle", "#3c3c3c", (3, 1.2), 1.4),
+    "icode_mppi_reads_env": Look("ICODE-MPPI, reads e", "#b8860b", (3, 1)),
+    "icode_mppi_one_step": Look("ICODE-MPPI, one step", "#8c510a", (1, 1)),
     "law": Look("Law alone", "#a0522d", (1.5, 1)),
     "law_nominal": Look("Law alone, of the nominal bicycle", "#cd853f", (1.5, 1)),
     "law_plant": Look("Law alone, of the true plant", "#6b4226", (1.5, 1)),
+    "nominal": Look("Nominal", SECOND, width=1.4),
+    "oracle": Look("Oracle", "#3c3c3c", (3, 1.2), 1.4),
 }
 """Name in the artefacts -> its look, in the order of tables and legends."""
 
