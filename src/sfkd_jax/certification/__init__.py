@@ -6,7 +6,6 @@
 from sfkd_jax.certification._attack import (
     CertificateContradicted as CertificateContradicted,
 )
-from sfkd_jax.certification._attack import attack_model as attack_model
 from sfkd_jax.certification._certificate import Certificate as Certificate
 from sfkd_jax.certification._certificate import certify as certify
 from sfkd_jax.certification._certificate import (
