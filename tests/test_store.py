@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import refusal_of
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save
 
 from sfkd_jax import store
 
@@ -173,20 +173,13 @@ def test_no_flipped_or_missing_byte_changes_what_is_read(path):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"PK\x03\x04", b"{}", b"\x80\x04pickle", b"\xff" * 64]
+    "content", [b"", b"PK\x03\x04", b"{}", b"\x80\x04pickle", save({"x": np.zeros(2)})]
 )
 def test_foreign_files_are_refused(path, content):
     path.parent.mkdir()
     path.write_bytes(content)
-    assert "truncated, damaged or foreign" in refusal(read, path)
-
-
-def test_a_file_of_others_has_no_manifest(path):
-    from safetensors.numpy import save_file
-
-    path.parent.mkdir()
-    save_file({"x": np.zeros(2)}, path)
-    assert "foreign, it has no manifest" in refusal(read, path)
+    says = "no manifest" if b"F64" in content else "truncated, damaged or foreign"
+    assert says in refusal(read, path)
 
 
 # ---- JSON

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from composing import composed, plain_settings, settings
+from composing import plain_settings, settings
 from helpers import put
 
 from sfkd_jax import build
@@ -109,4 +109,3 @@ def test_a_run_stays_below_the_root(setting):
 def test_plain_settings_come_back_as_the_same_objects():
     for option in OPTIONS:
         assert parse_settings(plain_settings(option)) == settings(option)
-        assert composed(option).seed == 0

@@ -102,9 +102,7 @@ class Checks:
 
     def _one(self, log: Log) -> tuple[Log, list[Finding]]:
         """A run after cutting, and the findings about it alone."""
-        log, found = self._drop_missing_rows(log)
-        log, slow = self._drop_slow_rows(log)
-        found += slow
+        log, found = self._drop_rows(log)
         wrong: list[Finding] = []
         for name, values in log.channels(self.columns).items():
             bad = ~np.isfinite(values) | (np.abs(values) > LARGEST)
@@ -139,29 +137,32 @@ class Checks:
             found += self._delays(log)
         return log, found
 
-    def _drop_missing_rows(self, log: Log) -> tuple[Log, list[Finding]]:
-        """Drop rows in which a number is missing, if asked, and cut the run there."""
-        if not self.drop_missing:
-            return log, []
-        named = log.channels(self.columns)
-        missing = np.isnan(np.column_stack([*named.values()]))
-        rows: Bool[np.ndarray, " time"] = np.any(missing, axis=1)
-        return _dropped(
-            log,
-            rows,
-            lambda k: f"{[*named][int(missing[k].argmax())]} is nan",
-            f", {100 * rows.mean():.2g} % of the rows, dropped by dataset.missing=drop",
-        )
-
-    def _drop_slow_rows(self, log: Log) -> tuple[Log, list[Finding]]:
-        """Drop rows slower than `min_speed` and cut the run there."""
+    def _drop_rows(self, log: Log) -> tuple[Log, list[Finding]]:
+        """Drop rows that lack a number, if asked, and slow ones; cut the run there."""
+        found: list[Finding] = []
+        if self.drop_missing:
+            named = log.channels(self.columns)
+            missing = np.isnan(np.column_stack([*named.values()]))
+            rows: Bool[np.ndarray, " time"] = np.any(missing, axis=1)
+            found += _first(
+                log,
+                rows,
+                lambda k: f"{[*named][int(missing[k].argmax())]} is nan",
+                hint=f", {100 * rows.mean():.2g} % of the rows, dropped by "
+                f"dataset.missing=drop{CUT_THERE}",
+                refused=False,
+            )
+            log = log.select(~rows)
         speed, name = log.states[:, 3], self.columns.state[3]
-        return _dropped(
+        slow = np.abs(speed) < self.min_speed
+        found += _first(
             log,
-            np.abs(speed) < self.min_speed,
+            slow,
             lambda k: f"{name} is {speed[k]:.3g} m/s",
-            f", dropped by dataset.min_speed={self.min_speed:g}",
+            hint=f", dropped by dataset.min_speed={self.min_speed:g}{CUT_THERE}",
+            refused=False,
         )
+        return log.select(~slow), found
 
     def _cut_at_jumps(self, log: Log) -> tuple[Log, list[Finding]]:
         """Cut a run where time goes back and where position or yaw jump.
@@ -449,14 +450,6 @@ def _first(
         k = int(bad.argmax())
         row = k + len(log.time) - len(bad)
         yield Finding(f"{log.at(row)}: {text(k)}{more(bad)}{hint}", refused)
-
-
-def _dropped(
-    log: Log, bad: Bool[np.ndarray, " time"], text: Callable[[int], str], why: str
-) -> tuple[Log, list[Finding]]:
-    """A run without some rows, cut there, and a line about them."""
-    found = _first(log, bad, text, hint=f"{why}{CUT_THERE}", refused=False)
-    return log.select(~bad), list(found)
 
 
 def more(bad: Bool[np.ndarray, " row"]) -> str:

@@ -101,7 +101,6 @@ def icode(
         space, (width,) * layers, activations, last=0.1, affine_in=affine_in
     )
 
-    # What the authors use; with learned increments it loses nothing.
     def euler(rate: Callable[[State], State], state: State, dt: float) -> State:
         return state + dt * rate(state)
 
