@@ -161,7 +161,7 @@ def recovery():
 
     def found(car, way):
         row = rows[car, f"steering offset 1.0 degrees, {way}"]
-        return f"{row['within_3s']:.1%}; {row['s_99']} s"
+        return f"{row['within_3s']:.1%}; {row['s_99'] or '–'} s"
 
     jumps, silent = ("jump", "alternating", "yaw"), ("frozen", "late", "lost")
     cells = {
