@@ -76,14 +76,6 @@ def corridor():
             "the same, nominal bicycle",
             *(f"{error(car, 'nominal'):.0f}" for car in CARS),
         ],
-        [
-            "the law alone: learned; of the true car; of the nominal bicycle",
-            *(
-                f"{error(car, 'law'):.1f}; {error(car, 'law_plant'):.1f}; "
-                f"{error(car, 'law_nominal'):.0f}"
-                for car in CARS
-            ),
-        ],
     ]
     return table(["", *CARS], lines)
 
