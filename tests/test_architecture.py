@@ -83,7 +83,7 @@ LINES = {"src": 25_740, "tests": 15_500, "benchmarks, experiments": 2_500}
 FILES_IN_SRC = 134
 
 OPTIONS, EXPERIMENTS = 65, 10
-COMMITTED = {"*.json": 700_000, "figures": 1_900_000}
+COMMITTED = {"*.json": 690_000, "figures": 1_150_000}
 COMMENTS = 0.03
 """Share of the lines of src that are comments."""
 LONGEST_FILE, LONGEST_FUNCTION, MEDIAN_FUNCTION = 500, 80, 9
