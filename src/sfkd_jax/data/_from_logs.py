@@ -117,13 +117,12 @@ def from_logs(
     parts, whole = assign_parts(runs, shares=shares, seed=seed)
     waits = np.concatenate([log.waits[log.joined] for log in logs])
     seconds = float(waits.sum())
-    sizes = [f"{int((parts == k).sum())} {name}" for k, name in enumerate(PARTS)]
-    used = 100 * len(runs) * steps * dt / seconds
+    sizes = (f"{int((parts == k).sum())} {name}" for k, name in enumerate(PARTS))
     report(
-        f"{len(logs)} runs, {seconds:.0f} s at {1 / np.median(waits):.4g} Hz; "
+        f"{len(logs)} runs, {seconds:.0f} s at {1 / np.median(waits):.4g} Hz, "
         f"sampled every {dt:g} s (states linearly, yaw unwrapped; controls "
         f"averaged over each step, environment held); {len(runs)} segments "
-        f"of {steps} steps, {used:.0f} % of the time: {', '.join(sizes)}"
+        f"of {steps} steps, {len(runs) * steps * dt / seconds:.0%}: {', '.join(sizes)}"
     )
     if not whole:
         report(
