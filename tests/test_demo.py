@@ -36,7 +36,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
         file = demo.SHIPPED / "kinematic_path" / "certificate.json"
         corridor = json.loads(file.read_text())["corridor"]
         assert own["max_deviation_m"] <= corridor["corridor_m"]
-        assert "corridor 0.380 m to each side" in done.stderr
+        assert f"corridor {corridor['corridor_m']:.3f} m to each side" in done.stderr
 
 
 def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
