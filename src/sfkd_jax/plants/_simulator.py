@@ -54,10 +54,8 @@ class Pool:
         self.about = first.start()
         # The other processes start when there is work for them.
         more = self.about.pop("workers") - 1
-        self._workers, self._lock = (
-            [first, *(_Worker(make) for _ in range(more))],
-            Lock(),
-        )
+        self._workers = [first, *(_Worker(make) for _ in range(more))]
+        self._lock = Lock()
 
     def step(self, rows: np.ndarray) -> np.ndarray:
         """Return the state one step after each row (state, control, environment)."""
