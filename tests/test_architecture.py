@@ -41,7 +41,7 @@ ARROWS = {
     "data": PLANT | {"store"},
     "evaluation": PLANT,
     "certification": PARTS,
-    "build": PARTS | {"models", "settings"},
+    "build": PARTS | {"models", "settings", "store"},
     "policy": PARTS | {"build", "certification", "settings", "store"},
     "export": CORE | {"build", "policy", "settings", "store"},
     "adapters": PLANT | {"build"},

@@ -13,11 +13,11 @@ from composing import settings
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import evaluate
-from sfkd_jax.experiment import data, runs, stages
+from sfkd_jax import build, evaluate, plants
+from sfkd_jax.experiment import data, identified, runs, stages
 
 sys.path.append(str(Path(__file__).parent / "data"))
-from recorded import recorded_run, write_csv
+from recorded import NAMES, drive, hand_driven, recorded_run, write_csv
 
 STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
 SMALL = (
@@ -143,3 +143,94 @@ def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tm
     assert identity(tmp_path / "moved") == here
     (tmp_path / "moved" / "0.csv").unlink()
     assert identity(tmp_path / "moved") != here
+
+
+class Car:
+    """A car that nobody knows: the kinematic plant, of another mass."""
+
+    def __init__(self):
+        plant = plants.kinematic(mass=2100.0)
+        self.dt, self.wheelbase = plant.dt, plant.wheelbase
+        self.state_names = plant.state_names
+        self.control_low, self.control_high = plant.control_low, plant.control_high
+        self._advance = jax.jit(plant.step)
+
+    def reset(self, state):
+        self.state = np.asarray(state, np.float32)
+
+    def step(self, control, env):
+        self.state = self._advance(self.state, np.float32(control), np.float32(env))
+        return self.state
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """Six runs of that car under its own driver; a number is missing in one row."""
+    folder, car, box = (
+        tmp_path_factory.mktemp("car") / "logs",
+        Car(),
+        [[0.4, -5], [0.9, 5]],
+    )
+    folder.mkdir()
+    for k in range(6):
+        rows = np.array([*drive(car, hand_driven(car, k), box, seconds=30, seed=k)])
+        columns = dict(zip(NAMES, rows.T, strict=True))
+        if not k:
+            columns["wind"][100] = np.nan
+        write_csv(folder / f"{k}.csv", columns)
+    return folder
+
+
+def logged(folder, *more):
+    words = ("vehicle=logged", f"vehicle.path={folder}", f"root={folder.parent}")
+    return identified.with_identified(settings("+experiment=s3", *words, *more))
+
+
+def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsys):
+    monkeypatch.setattr(identified, "REGRESSION", 400)
+    chosen = logged(driven, "vehicle.missing=drop")
+    said = capsys.readouterr().err
+    assert "wind is nan, 0.33 % of the rows, dropped" in said
+    assert "it is the regression" in said
+    plant = build.build_vehicle(chosen.vehicle)
+    for limits in chosen.environment.box.values():
+        assert 0.4 <= limits[0] <= 0.9
+        assert -5 <= limits[1] <= 5
+    assert 5.0 < chosen.dataset.speed[0] < chosen.dataset.speed[1] <= 12.0
+    assert chosen.dataset.law.speed == chosen.dataset.speed
+    assert -0.5 < plant.control_low[0] < -0.02 < 0.02 < plant.control_high[0] < 0.5
+    state, control, env = np.float32([5, 2, 1, 9]), np.float32([0.03, 0.5]), (0.5, 3.0)
+    car = Car()
+    car.reset(state)
+    expected = car.step(control, env)
+    after = jax.jit(plant.step)(state, control, np.float32(env))
+    np.testing.assert_allclose(after, expected, atol=5e-3)
+    # What the run is made from are the contents of the logs, wherever they lie.
+    moved = driven.parent / "moved"
+    shutil.copytree(driven, moved)
+    again = logged(moved, "vehicle.missing=drop")
+    assert "fitted" not in capsys.readouterr().err
+    assert data.config(again) == data.config(chosen)
+    (moved / "1.csv").unlink()
+    assert data.fingerprint(str(moved)) != chosen.vehicle.contents
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ((), "wind is nan"),
+        (("vehicle.path=null",), "vehicle=logged needs vehicle.path=FOLDER"),
+        (
+            ("vehicle.missing=drop", "vehicle.columns.environment=[t2]"),
+            "no column t2 among t, p_x",
+        ),
+        (
+            ("vehicle.missing=drop", "dataset.speed=[20,30]"),
+            "dataset.speed is 20 to 30 m/s, the logs of the vehicle reach 6",
+        ),
+    ],
+)
+def test_logs_that_make_no_vehicle_are_refused_in_one_line(driven, more, says):
+    with pytest.raises(ValueError, match=says) as refused:
+        logged(driven, *more)
+    assert "\n" not in str(refused.value)

@@ -142,6 +142,11 @@ class Policy(TrainedModel):
         told = _ranges(names, *([speed, *corner] for speed, corner in ends))
         dwell = "{:g} to {:g} s".format(*under["dwell_s"])
         yield f"under: {told}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
+        if not build.is_claimed(document):
+            yield (
+                "of a model of its logs, not of the car: nothing is claimed of that "
+                "before sfkd collect"
+            )
 
     def _with_corridor(self) -> dict[str, Any]:
         """Return the certificate; a ValueError says that it has no corridor."""

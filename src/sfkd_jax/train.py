@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax import store
+from sfkd_jax import build, store
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
@@ -47,7 +47,7 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
         return about
     certificate = stages.certify_policy(settings)
     results = None
-    if trained.vehicle.simulated:
+    if build.build_vehicle(settings.vehicle).simulated:
         results = str(evaluate_run(settings, command=command_line("train")))
     else:
         store.print_message(

@@ -44,7 +44,9 @@ def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(
     """The law requests thousands of radians; a perturbation that compensates for them
     would persist.
     """
-    controller, params, act = compiled(law=control.ModelLaw())
+    controller, params, act = compiled(
+        law=control.LinearFeedback(wheelbase=PLANT.wheelbase)
+    )
     span = np.subtract(PLANT.control_high, PLANT.control_low)
     for entry, value in ((0, 4e4), (1, -4e4), (3, 1e6)):
         state, seen = controller.init(jax.random.key(0)), OFFSET.copy()

@@ -14,7 +14,7 @@ from helpers import jit
 import sfkd_jax
 from sfkd_jax import plants, policy
 from sfkd_jax.control import derive_path_law
-from sfkd_jax.experiment import data
+from sfkd_jax.experiment import data, identified
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
 
@@ -147,14 +147,14 @@ def test_a_law_of_a_model_fitted_to_runs_without_a_law_holds_the_car(
     monkeypatch, capsys
 ):
     """Or is refused: a bad model promises what the car does not keep."""
-    monkeypatch.setattr(data, "REGRESSION", 1500)
+    monkeypatch.setattr(identified, "REGRESSION", 1500)
     chosen = settings(*LEARNED)
     assert chosen.dataset.law.model == "learned"
     data.derive_law(chosen)
     says = r"within ([\d.]+) mm \(RMS\) of its paths, the model promises ([\d.]+) mm"
     found, promised = map(float, re.search(says, capsys.readouterr().err).groups())
     assert found < 1.2 * promised
-    monkeypatch.setattr(data, "REGRESSION", 1)
+    monkeypatch.setattr(identified, "REGRESSION", 1)
     with pytest.raises(ValueError, match="fitted badly") as refused:
         data.derive_law(chosen)
     assert "\n" not in str(refused.value)

@@ -1,7 +1,12 @@
 """A run that is known at every moment, and files of it as recorders write them."""
 
+import jax
 import numpy as np
 
+from sfkd_jax.scenarios import project, reference_window, smooth_path
+
+PROJECT = jax.jit(project)
+WINDOW = jax.jit(reference_window, static_argnames=("dt", "horizon"))
 STATE = ("p_x", "p_y", "yaw", "v")
 NAMES = ("t", *STATE, "steering", "acceleration", "friction", "wind")
 WHEELBASE = 2.7
@@ -50,3 +55,41 @@ def write_csv(path, columns, separator=","):
 def write_npz(path, columns):
     np.savez(path, **columns)
     return str(path)
+
+
+def hand_driven(car, seed):
+    """A driver that nobody knows: (observation, env, reference) -> control."""
+    random, noise = np.random.default_rng(seed), np.zeros(2)
+
+    def act(observation, env, reference):
+        noise[:] = 0.85 * noise + random.normal(0.0, [0.012, 0.4])
+        (x, y, yaw, _), (_, _, after, _) = reference[:2]
+        dx, dy = observation[0] - x, observation[1] - y
+        aside = np.cos(yaw) * dy - np.sin(yaw) * dx
+        turned = np.angle(np.exp(1j * (observation[2] - yaw)))
+        bend = (after - yaw) / (reference[0, 3] * car.dt)
+        steer = car.wheelbase * bend - 0.04 * aside - 0.5 * turned
+        push = 0.6 * (reference[0, 3] - observation[3])
+        control = np.array([steer, push]) + noise
+        return np.clip(control, car.control_low, car.control_high)
+
+    return act
+
+
+def drive(car, act, box, *, seconds, seed, speed=(8.0, 11.0), bend=0.02):
+    """One run on a random road while e switches in its box: rows as a log has them."""
+    random, key = np.random.default_rng(seed), jax.random.key(seed)
+    path = smooth_path(key, length=speed[1] * seconds + 60.0, peak_curvature=bend)
+    state, along = np.zeros(len(car.state_names)), 0.0
+    state[3], phase = speed[0], random.uniform(0.0, 2.0 * np.pi)
+    for k in range(round(seconds / car.dt)):
+        if k % 40 == 0:
+            env = random.uniform(*box)
+        wave = 0.5 + 0.5 * np.sin(0.25 * k * car.dt + phase)
+        wanted = speed[0] + (speed[1] - speed[0]) * wave
+        reference = np.asarray(WINDOW(path, along, wanted, dt=car.dt, horizon=20))
+        control = np.asarray(act(state.astype(np.float32), env, reference), float)
+        yield [k * car.dt, *state, *control, *env]
+        car.reset(state)
+        state = np.asarray(car.step(control, env), float)
+        along, _ = PROJECT(path, state[:2], along + state[3] * car.dt)

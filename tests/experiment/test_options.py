@@ -18,7 +18,8 @@ OPTIONS = [
     if file.parent.name != "hydra"
 ]
 LIMITS = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
-GIVEN = {"own": LIMITS, "simulator": ("vehicle.env=tests.plants.simulators:Faulty",)}
+GIVEN = {"own": LIMITS, "logged": LIMITS}
+GIVEN |= {"simulator": ("vehicle.env=tests.plants.simulators:Faulty",)}
 
 
 def of(group):

@@ -9,12 +9,13 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 
-from sfkd_jax import control, models, plants, scenarios
+from sfkd_jax import control, models, plants, scenarios, store
 from sfkd_jax.build._controllers import CONTROLLER_SETTINGS as CONTROLLER_SETTINGS
 from sfkd_jax.build._controllers import ENV_SOURCES as ENV_SOURCES
 from sfkd_jax.build._controllers import PLANNERS as PLANNERS
@@ -23,7 +24,8 @@ from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import build_in_lane as build_in_lane
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
 from sfkd_jax.build._controllers import in_corridor as in_corridor
-from sfkd_jax.data import Driver
+from sfkd_jax.build._controllers import is_claimed as is_claimed
+from sfkd_jax.data import Columns, Driver, from_logs
 from sfkd_jax.geometry import PATH_SPEED
 from sfkd_jax.ranges import Positive, imported
 from sfkd_jax.settings import (
@@ -36,14 +38,17 @@ from sfkd_jax.settings import (
     schema,
     takes,
 )
-from sfkd_jax.types import Control, Model, Reference, Space, State
+from sfkd_jax.types import Control, Model, Reference, Space, State, Step
 
 PLANTS = {
     "kinematic": plants.kinematic,
     "kinematic_stiff": plants.kinematic_stiff,
     "dynamic": plants.dynamic,
     "own": plants.own,
+    "logged": plants.own,
 }
+IDENTIFIED = "vehicle"
+"""Kind of the file that holds the model of a vehicle of logs."""
 MODELS = models.FACTORIES | {"own": models.own}
 """Models of settings: those of the package, and one from outside by name."""
 LAW_MODELS = ("learned", "nominal", "plant")
@@ -75,12 +80,40 @@ class OwnVehicleSettings(VehicleSettings):
     env: str | None = None
 
 
+takes_logs = takes(
+    from_logs,
+    skip=(
+        *("dt", "wheelbase", "limits", "needs_environment", "report"),
+        *("env_low", "env_high"),
+    ),
+    columns=schema("Columns", object, Columns),
+)
+"""Makes a class a dataclass with the arguments of `data.from_logs`."""
+
+
+@takes_logs
+class LoggedVehicleSettings(VehicleSettings):
+    """A vehicle known from its logs, in whose place a model of them is simulated.
+
+    Attributes:
+        path: of the logs, a file, a folder or a glob.
+        contents: hash of the logs; it is found from `path`.
+        identified: file of the model; it is made from the logs.
+    """
+
+    columns: Any
+    path: str | None = None
+    contents: str | None = None
+    identified: str | None = None
+
+
+_KINDS = {"own": OwnVehicleSettings, "logged": LoggedVehicleSettings}
 VEHICLES = {
     name: schema(
         "Vehicle",
-        OwnVehicleSettings if name == "own" else VehicleSettings,
+        _KINDS.get(name, VehicleSettings),
         plant,
-        skip=("stiffness_by_friction",),
+        skip=("stiffness_by_friction", "step"),
     )
     for name, plant in PLANTS.items()
 }
@@ -96,11 +129,21 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
         options["step"] = lambda *inputs: imported(name, "vehicle.step")(*inputs)
     if (simulator := getattr(settings, "env", None)) is not None:
         options["step"] = plants.on_host(simulator)
-    plant = factory(**options)
+    if (file := getattr(settings, "identified", None)) is not None:
+        options["step"] = lambda *inputs: _identified(file)(*inputs)
+    plant = factory(**options)._replace(name=settings.name)
     if settings.inner_loop == "none":
         return plant
     # Only the speed loop changes what the second control means.
     return plants.with_speed_loop(plant, gain=settings.speed_gain)
+
+
+@cache
+def _identified(file: str) -> Step:
+    """Return the step of the model in a file."""
+    # Arrays of numpy: those of jax would belong to the program that is traced now.
+    tree = models.nested(store.read_arrays(Path(file), kind=IDENTIFIED)[0])
+    return models.step_of(models.one_step(Space(**tree["space"])), tree["params"])
 
 
 @takes(scenarios.scenario, skip=("state_size", "dt", "duration", "env_low", "env_high"))
@@ -238,8 +281,8 @@ def _check_law(
     for name, wanted in {**ends, "perturbation": asked["perturbation"]}.items():
         if not jnp.allclose(law[name], jnp.asarray(wanted), rtol=1e-6, atol=0.0):
             raise ValueError(f"its law has {name} {law[name]}, its settings {wanted}")
-    # The second control of an own vehicle may be anything.
-    if settings["vehicle"]["name"] == "own" or vehicle.speed_loop:
+    # The second control of a vehicle of one's own may be anything.
+    if settings["vehicle"]["name"] in _KINDS or vehicle.speed_loop:
         return
     # The speed is the integral of the acceleration, so that the linear regulator has a
     # gain in closed form, which tells the sampling period.

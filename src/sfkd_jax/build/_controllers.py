@@ -71,8 +71,8 @@ class ControllerSettings:
     Attributes:
         name: of its rows.
         planner: its name in `PLANNERS`; `controller.PLANNER` are its own settings.
-        sampling: "feedback" around the path-following law, "model" around that of the
-            model, "plain" around nothing, "law" around that of the path coordinates.
+        sampling: "feedback" around the path-following law, "plain" around nothing,
+            "law" around that of the path coordinates.
         cost: of `control.tracking_cost`.
         task: of `control.path_tracking`.
     """
@@ -137,7 +137,6 @@ def _controller_schema(planner: str) -> type[ControllerSettings]:
         base, skip = SearchSettings, _DECIDED
         factories |= {
             "feedback": control.path_feedback,
-            "model_law": control.ModelLaw,
             "gate": control.Gate,
             "adaptation": control.Adaptation,
             "online_tube": control.OnlineTube,
@@ -309,7 +308,6 @@ def _task(
     )
     laws = {
         "feedback": feedback,
-        "model": control.ModelLaw(**arguments(settings.model_law, control.ModelLaw)),
         "plain": control.no_feedback(speed_loop=plant.speed_loop),
     }
     law = choose(laws, settings.sampling, "controller.sampling")
@@ -351,7 +349,14 @@ def in_corridor(
         conditions=_conditions(certificate),
         dt=plant.dt,
         rear=_rear(law),
+        claimed=is_claimed(certificate),
     ).controller()
+
+
+def is_claimed(certificate: Mapping[str, Any]) -> bool:
+    """Whether a corridor was measured on the vehicle, not on a model of its logs."""
+    identified = "identified_from" in certificate["corridor"]["conditions"]
+    return not identified or "recorded" in certificate
 
 
 def _rear(law: control.PathLaw) -> float:

@@ -387,6 +387,9 @@ def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
     given = drive_class(data) | {name: data[name] for name in EXCITATION}
     given["law_model"] = data["law"]["model"]
     dwell, dt = stated["dwell_s"], settings["vehicle"]["dt"]
+    # The vehicle that was driven is a model of these logs.
+    if contents := settings["vehicle"].get("contents"):
+        given["identified_from"] = contents
     return {
         **{name: Follows(value) for name, value in given.items()},
         "env_box": Follows(document["env_box"], ROUNDED),

@@ -6,7 +6,6 @@ from sfkd_jax.control.lanes._in_lane import in_lane as in_lane
 from sfkd_jax.control.lanes._manoeuvre import Class as Class
 from sfkd_jax.control.lanes._manoeuvre import Manoeuvres as Manoeuvres
 from sfkd_jax.control.laws._feedback import LinearFeedback as LinearFeedback
-from sfkd_jax.control.laws._feedback import ModelLaw as ModelLaw
 from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
 from sfkd_jax.control.laws._feedback import no_feedback as no_feedback
 from sfkd_jax.control.laws._feedback import path_errors as path_errors

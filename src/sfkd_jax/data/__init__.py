@@ -11,6 +11,7 @@ from sfkd_jax.data._dataset import random_windows as random_windows
 from sfkd_jax.data._dataset import sizes_of_parts as sizes_of_parts
 from sfkd_jax.data._dataset import split as split
 from sfkd_jax.data._dataset import spread_windows as spread_windows
+from sfkd_jax.data._from_logs import LoggedDataset as LoggedDataset
 from sfkd_jax.data._from_logs import fingerprint as fingerprint
 from sfkd_jax.data._from_logs import from_logs as from_logs
 from sfkd_jax.data._generation import SCENARIOS as SCENARIOS

@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from sfkd_jax import training
 from sfkd_jax.certification import CertificateStale, CertificationRefused
+from sfkd_jax.experiment.identified import with_identified
 from sfkd_jax.experiment.options import Settings, parse_settings, register
 from sfkd_jax.experiment.runs import IDENTITY
 from sfkd_jax.settings import replace
@@ -62,7 +63,7 @@ def hydra_command(run: Run) -> Callable[[], None]:
             # Small factorisations, in every step of a training: threads of BLAS would
             # wait for each other, and keep XLA's waiting, for half of the time.
             with threadpool_limits(1, user_api="blas"):
-                document = run(settings)
+                document = run(with_identified(settings))
         except KeyboardInterrupt:
             print_message("sfkd_jax: interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
@@ -137,7 +138,8 @@ def _typed() -> list[str]:
 
 def compose(*overrides: str) -> Settings:
     """Return the settings of the running command under further overrides."""
-    return settings_of(hydra.compose("config", [*_typed(), *overrides]))
+    composed = hydra.compose("config", [*_typed(), *overrides])
+    return with_identified(settings_of(composed))
 
 
 def command_line(name: str) -> str:

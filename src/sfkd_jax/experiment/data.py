@@ -13,31 +13,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, store
+from sfkd_jax import build, models, store
+from sfkd_jax.build import LoggedVehicleSettings
 from sfkd_jax.control import PathLaw, derive_path_law, law_from_arrays
 from sfkd_jax.data import (
     PARTS,
     SCENARIOS,
-    Columns,
     Dataset,
     check_on_path,
     environment_box,
     fingerprint,
-    from_logs,
     generate,
     generate_along_path,
     generate_open_loop,
-    measure_space,
-    random_windows,
     segment_scenarios,
     split,
 )
+from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.options import LogSettings, Settings
-from sfkd_jax.models import one_step
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.settings import arguments
-from sfkd_jax.training import descend, one_step_loss
-from sfkd_jax.types import BODY, Key, Model, Step, Trajectory
+from sfkd_jax.types import BODY, Key, Step, Trajectory
 
 DATASET, LAW = "dataset", "law"
 SWITCHING, OPEN_LOOP, ALONE = 2, 3, 4
@@ -46,8 +42,6 @@ QUIET = (1e-6, 2e-6)
 """Excitation of the law alone: none, but with a logarithm."""
 STRAYS, SLACK = 1.5, 5.0
 """A law is accepted up to this factor of what its model promises, and so many mm."""
-REGRESSION = 16_000
-"""Optimiser steps of the model that a law is derived from."""
 
 
 def config(settings: Settings) -> dict[str, Any]:
@@ -59,7 +53,11 @@ def config(settings: Settings) -> dict[str, Any]:
         dataset["contents"] = fingerprint(logs.path)
         dataset["environment_known"] = environment.is_known
     box = {"low": environment.low, "high": environment.high}
-    about = {"vehicle": settings.vehicle, "environment": box, "dataset": dataset}
+    vehicle = store.plain(settings.vehicle)
+    if isinstance(settings.vehicle, LoggedVehicleSettings):
+        # `contents` say what the vehicle is; where that lies is no matter.
+        del vehicle["path"], vehicle["identified"]
+    about = {"vehicle": vehicle, "environment": box, "dataset": dataset}
     return store.plain(about)
 
 
@@ -85,7 +83,8 @@ def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
 
 def _simulate(settings: Settings) -> Dataset:
     """Simulate a data set with the vehicle of the settings."""
-    check_step(build.build_vehicle(settings.vehicle))
+    environments = len(settings.environment.low or (0, 0))
+    check_step(build.build_vehicle(settings.vehicle), environments)
     options: Any = settings.dataset
     # A key each: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
@@ -137,26 +136,7 @@ def _generator(
 
 def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:
     """Read a data set from logs, and write what it covers beside it."""
-    plant = build.build_vehicle(settings.vehicle)
-    columns = Columns(**arguments(logs.columns, Columns))
-    if len(columns.state) != len(plant.state_names):
-        raise ValueError(
-            f"dataset.columns.state names {len(columns.state)} columns, "
-            f"vehicle {plant.name} has {', '.join(plant.state_names)}; "
-            "name as many, in this order"
-        )
-    store.print_message(f"reading {logs.path}")
-    logged = from_logs(
-        logs.path,
-        columns,
-        report=store.print_message,
-        dt=plant.dt,
-        wheelbase=plant.wheelbase,
-        needs_environment=settings.environment.is_known,
-        limits=(plant.control_low or None, plant.control_high or None),
-        **settings.environment.box,
-        **arguments(logs, from_logs),
-    )
+    logged = identified.read(settings.vehicle, settings.environment, logs)
     store.write_json(dataset_path(settings).with_name("coverage.json"), logged.coverage)
     return logged.dataset
 
@@ -224,7 +204,12 @@ def derive_law(settings: Settings) -> PathLaw:
     along: Any = settings.along_path
     plant = build.build_vehicle(settings.vehicle)
     steps = {"plant": lambda: plant.step, "nominal": lambda: plant.nominal}
-    steps["learned"] = partial(_learned_step, settings, plant)
+    # A model of logs is a learned one already.
+    steps["learned"] = (
+        steps["plant"]
+        if isinstance(settings.vehicle, LoggedVehicleSettings)
+        else partial(_learned_step, settings, plant)
+    )
     step = steps[along.law.model]()
     store.print_message(
         f"deriving the law of vehicle {plant.name} from its {along.law.model} model"
@@ -238,7 +223,8 @@ def derive_law(settings: Settings) -> PathLaw:
         **arguments(along.law, derive_path_law),
     )
     law = jax.jit(derive)()
-    if along.law.model != "plant":
+    # Beside itself a model of logs would find nothing.
+    if along.law.model != "plant" and step is not plant.step:
         _check_law(settings, plant, law, step)
     return law
 
@@ -301,34 +287,12 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
         env_high=jnp.asarray(settings.environment.high),
         scenarios=jnp.zeros(runs.controls.shape[0], jnp.int32),
     )
-    model, start = _identified(dataset, start_key)
-    loss, draw = one_step_loss(model), partial(random_windows, batch=512, length=1)
-    params = descend(start, loss, draw, dataset.train, fit_key, steps=REGRESSION)
+    model, _, params = identified.regression(dataset, start_key, fit_key)
     store.print_message(
         f"fitted a model of vehicle {plant.name} to {runs.controls.shape[0]} runs in "
         f"{time.perf_counter() - begun:.0f} s"
     )
-    return _step_of(model, params)
-
-
-def least_squares(dataset: Dataset) -> Step:
-    """Return the best linear model of one step, of the training part of a data set."""
-    model, params = _identified(dataset, jax.random.key(0))
-    # Without a scale the network, which nothing has trained yet, has no say.
-    return _step_of(model, params | {"scale": 0.0 * params["scale"]})
-
-
-def _identified(dataset: Dataset, key: Key) -> tuple[Model, Any]:
-    """The model of one step, and its parameters before any training."""
-    model = one_step(measure_space(dataset))
-    identify: Any = model.fitting.identify
-    return model, jax.jit(identify)(dataset.train, dataset.validation, key)
-
-
-def _step_of(model: Model, params: Any) -> Step:
-    return lambda state, control, env: model.step(
-        model.fiber(params, env), state, control
-    )
+    return models.step_of(model, params)
 
 
 def closed_loop(settings: Settings) -> Vehicle:

@@ -48,7 +48,7 @@ class SystemResult(NamedTuple):
 def make_episodes(settings: Settings) -> EpisodeSet:
     """Draw the episodes of a scenario."""
     plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
-    check_step(plant)
+    check_step(plant, len(settings.environment.low or (0, 0)))
     about: Any = {"duration": protocol.episode_s} | settings.environment.box
     family = build.build_scenario(settings.scenario, plant, **about)
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)

@@ -108,11 +108,7 @@ class AlongPathSettings(DatasetSettings):
     law: LawSettings
 
 
-@takes(
-    data.from_logs,
-    skip=("dt", "wheelbase", "limits", "needs_environment", "report", *_BOX),
-    columns=schema("Columns", object, data.Columns),
-)
+@build.takes_logs
 class LogSettings(DatasetSettings):
     """Recorded logs; the other fields are arguments of `data.from_logs`."""
 

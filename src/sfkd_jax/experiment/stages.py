@@ -24,7 +24,7 @@ from sfkd_jax.data import (
     spread_windows,
 )
 from sfkd_jax.evaluation import open_loop
-from sfkd_jax.experiment import data, runs
+from sfkd_jax.experiment import data, identified, runs
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.models import physics
 from sfkd_jax.plants import Vehicle, check_step
@@ -45,7 +45,7 @@ def check_settings(settings: Settings) -> None:
     """
     plant = build.build_vehicle(settings.vehicle)
     if plant.simulated:
-        check_step(plant)
+        check_step(plant, len(settings.environment.low or (0, 0)))
     options, window = settings.dataset, settings.training.window
     check_shares(options.shares)
     if window > options.steps:
@@ -189,7 +189,7 @@ def _open_loop_document(
     simple = {"kinematic_bicycle": plant.nominal}
     # Controls along a path are perturbations of a law, which is not linear.
     if not along:
-        simple["least_squares"] = data.least_squares(dataset)
+        simple["least_squares"] = identified.least_squares(dataset)
     others = {name: physics(step, along_path=along) for name, step in simple.items()}
 
     @jax.jit
@@ -247,6 +247,8 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         verdict = f"alpha {document['alpha']:.6f}"
     if corridor := document.get("corridor"):
         verdict += f"; corridor {corridor['corridor_m']:.3f} m to each side, measured"
+        if "identified_from" in corridor["conditions"]:
+            verdict += " on the model of the logs, not on the car"
     if d_bar := document.get("d_bar"):
         about = f"holds for {d_bar['holds_for']} (measured, unsigned)"
         verdict += f"; d_bar {d_bar['value']:.4g} {about}"
@@ -300,6 +302,8 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
             options.level,
             **arguments(options.corridor, certify_corridor),
         )
+        if contents := getattr(settings.vehicle, "contents", None):
+            document["corridor"]["conditions"]["identified_from"] = contents
     return document
 
 

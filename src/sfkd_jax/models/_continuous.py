@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import traverse_util
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import between, compose, rotate
@@ -29,6 +31,11 @@ from sfkd_jax.types import (
     Step,
     Trajectory,
 )
+
+flat = partial(traverse_util.flatten_dict, sep="/")
+"""Nested dictionaries -> path, as in "network/layers_0/bias" -> array."""
+nested = partial(traverse_util.unflatten_dict, sep="/")
+"""The inverse of `flat`."""
 
 
 def state_model(
@@ -223,6 +230,13 @@ def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
 
     model = state_model(lambda key: {}, Conditioned, step, vector=space.scaled_body)
     return model._replace(fitting=Fitting(identify=identify))
+
+
+def step_of(model: Model, params: Params) -> Step:
+    """Return the step of a model whose latent is the state."""
+    return lambda state, control, env: model.step(
+        model.fiber(params, env), state, control
+    )
 
 
 def _increment(before: State, after: State) -> State:

@@ -137,12 +137,13 @@ def on_host(make: Make) -> Step:
     return step
 
 
-def check_step(plant: Vehicle) -> None:
+def check_step(plant: Vehicle, environments: int = 2) -> None:
     """Refuse a step that is missing, fails or returns no state, from shapes only."""
     size = len(plant.state_names)
-    given = f"{size} states (vehicle.state_names), 2 controls and 2 environments"
+    given = f"{size} states (vehicle.state_names), 2 controls and {environments} "
+    given += "environments"
     try:
-        after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, 2)))
+        after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, environments)))
     except Exception as reason:  # a function of the user raises anything
         first = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(

@@ -24,10 +24,10 @@ from sfkd_jax.scenarios._obstacles import Course as Course
 from sfkd_jax.scenarios._obstacles import beside as beside
 from sfkd_jax.scenarios._obstacles import car_clearance as car_clearance
 from sfkd_jax.scenarios._obstacles import in_view as in_view
-from sfkd_jax.scenarios._paths import smooth_path as smooth_path
 from sfkd_jax.scenarios._scenarios import COURSES as COURSES
 from sfkd_jax.scenarios._scenarios import ROADS as ROADS
 from sfkd_jax.scenarios._scenarios import Family as Family
 from sfkd_jax.scenarios._scenarios import Scenario as Scenario
 from sfkd_jax.scenarios._scenarios import family as family
 from sfkd_jax.scenarios._scenarios import scenario as scenario
+from sfkd_jax.scenarios._scenarios import smooth_path as smooth_path

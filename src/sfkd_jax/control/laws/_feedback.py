@@ -1,17 +1,15 @@
-"""Feedback laws on the errors from a reference path: by hand, or from a model."""
+"""Feedback laws on the errors from a reference path, made by hand."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control.laws._recovery import (
-    CREEP,
     GRIP,
     PathErrors,
     SteadyTurn,
@@ -20,25 +18,8 @@ from sfkd_jax.control.laws._recovery import (
     often,
     recovering,
 )
-from sfkd_jax.control.laws._steady_turn import (
-    Linearised,
-    by_differentiation,
-    riccati_gain,
-    steady_turn,
-)
-from sfkd_jax.geometry import path_step, wrap_angle
-from sfkd_jax.ranges import Positive
-from sfkd_jax.types import BODY, Control, Fiber, Model, Reference, Scalar, State
-
-PROBE = 2e-3
-"""Curvature of a turn that tells how much steering a curvature takes [1/m]."""
-SHORTEST = 0.05
-"""Lower limit of what it tells [m]."""
-NEWTON = 4
-"""Newton steps to a steady turn from straight driving. For the benchmark's vehicles
-that reaches the accuracy of float32.
-"""
-
+from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.types import Control, Scalar, State
 
 FeedbackLaw: TypeAlias = Callable[[PathErrors, Scalar, Scalar], Control]
 """(path errors, curvature [1/m], reference speed [m/s]) -> control."""
@@ -161,120 +142,3 @@ def no_feedback(*, speed_loop: bool = False) -> FeedbackLaw:
         return jnp.stack([zero, speed if speed_loop else zero])
 
     return law
-
-
-class ModelLaw(NamedTuple):
-    """A feedback law around the steady turns of a model, with its Riccati gains.
-
-        u = u*(κ, v, e) − K(e) (ξ − ξ*(κ, v, e)),   ξ* = F(ξ*, u*; κ, e)
-
-    F is one step of the model in coordinates along a circle of curvature κ. ξ* has no
-    lateral error and the reference speed; K solves the Riccati equation of F linearised
-    there, with the weights below. In side wind ξ* crabs, on a slippery road u* steers
-    more: what the model knows of e becomes feed-forward, and a planner samples only the
-    rest. If Newton's method does not converge (the circle is too fast for the
-    friction), the law is that of straight driving, gain included. Far from the path
-    it is `recovering`.
-
-    Attributes:
-        lateral: weight in the Riccati equation [1/m²].
-        heading: weight [1/rad²].
-        speed: weight [s²/m²]; the weights of further body states are zero.
-        steering: weight [1/rad²].
-        drive: weight, per control unit².
-    """
-
-    lateral: float = 1.0
-    heading: float = 1.0
-    speed: float = 1.0
-    steering: Positive = 20.0
-    drive: Positive = 0.5
-
-    def prepare(
-        self,
-        model: Model,
-        fiber: Fiber,
-        like: State,
-        reference: Reference,
-        curvature: Array,
-    ) -> SteadyTurn:
-        """Return the steady turns at every point of a reference.
-
-        Args:
-            model: any model of world states.
-            fiber: of the environment.
-            like: a state, for its size.
-            reference: x, y, yaw, speed of each step.
-            curvature: of the path at each point [1/m].
-        """
-        size = like.shape[0] - 1
-
-        def step(state: State, control: Control, fiber: Fiber) -> State:
-            latent = model.step(fiber, model.encode(fiber, state), control)
-            return model.decode(fiber, latent)
-
-        along = path_step(step)
-
-        def turn(kappa: Scalar, speed: Scalar) -> Linearised:
-            return steady_turn(
-                lambda both: along(both[:size], both[size:], kappa, fiber),
-                # Newton starts from straight driving at the reference speed.
-                jnp.zeros(size + 2).at[2].set(speed),
-                by_differentiation,
-                steps=NEWTON,
-            )
-
-        # A car that stands has no turn: the slowest one, with which it would start.
-        speeds = jnp.maximum(reference[:, 3], CREEP)
-        # One point more, which tells how much steering a curvature takes.
-        curvature = jnp.append(curvature, PROBE)
-        both = jax.vmap(jax.vmap(turn), in_axes=(0, None))(
-            # Straight driving in the same batch: what is chosen where a turn fails.
-            jnp.stack([curvature, 0.0 * curvature]),
-            jnp.append(speeds, speeds[0]),
-        )
-        wheelbase = (both.both[0, -1, size] - both.both[1, -1, size]) / PROBE
-        both = jax.tree.map(lambda leaf: leaf[:, :-1], both)
-        # A circle that the tyres cannot hold has no steady turn: drive straight.
-        valid = both.steady[0]
-        chosen = jax.tree.map(lambda part: jax.vmap(jnp.where)(valid, *part), both)
-        # One gain, of the first step: it varies little over a horizon, and the Riccati
-        # recursion is the most expensive part.
-        gain = riccati_gain(
-            chosen.slopes[0],
-            (self.lateral, self.heading, self.speed),
-            jnp.asarray([self.steering, self.drive]),
-        )
-        state, control = jnp.split(chosen.both, [size], axis=1)
-        # No drive where the reference stands, or the car would creep.
-        control = control.at[:, 1].multiply(reference[:, 3] != 0.0)
-        state = state.at[:, 2].set(reference[:, 3])
-        # NaN compares as False.
-        bend = jnp.where(wheelbase > SHORTEST, wheelbase, SHORTEST)
-        grip = jnp.stack([bend, jnp.asarray(GRIP)])
-        return SteadyTurn(
-            state,
-            control,
-            jnp.broadcast_to(gain, (*control.shape, size)),
-            jnp.broadcast_to(grip, (*control.shape[:1], 2)),
-        )
-
-    def control(
-        self,
-        turn: SteadyTurn,
-        state: State,
-        point: Float[Array, " 4"],
-        curvature: Scalar,
-    ) -> tuple[Control, Scalar]:
-        """Return the control at one step of the reference, and `SteadyTurn.authority`.
-
-        Args:
-            turn: steady turn of the step.
-            state: in the world.
-            point: x, y, yaw, speed of the reference.
-            curvature: of the path at `point` [1/m].
-        """
-        errors = path_errors(state, point, curvature)
-        xi = jnp.concatenate([jnp.stack(errors[:2]), state[BODY]])
-        control = turn.feedback(xi).at[1].add(-holding(state[3], point[3]))
-        return control, turn.authority(xi)

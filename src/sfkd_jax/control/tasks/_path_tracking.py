@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import (
     FeedbackLaw,
-    ModelLaw,
     RecoveringFeedback,
     path_errors,
 )
@@ -146,7 +145,6 @@ class PathTarget(NamedTuple):
 
     point: Float[Array, "*horizon 4"]  # x, y, yaw, speed
     curvature: Float[Array, "*horizon"]  # of the path there [1/m]
-    turn: Any  # `SteadyTurn` of the law, or None if it is not a `ModelLaw`
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,11 +202,11 @@ class PathTracking(LawTask):
         J = Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
 
     Attributes:
-        law: u_ff + K ξ; see `path_feedback`, `ModelLaw` and `no_feedback`. All others
-            are those of `LawTask`.
+        law: u_ff + K ξ; see `path_feedback` and `no_feedback`. All others are those of
+            `LawTask`.
     """
 
-    law: FeedbackLaw | ModelLaw
+    law: FeedbackLaw
 
     def prepare(
         self,
@@ -219,16 +217,13 @@ class PathTracking(LawTask):
         previous: PlanningStart,
     ) -> RolloutSetup:
         """Return fibre, start, law and targets, evaluated once per control step."""
-        model, law = self.model, self.law
+        model = self.model
         reference, known = followable(reference)
         # Many rollouts share this fibre; folding parameters that are folded is free.
         fiber = model.fiber(fold(model, params), env)
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
-        turns = None
-        if isinstance(law, ModelLaw):
-            turns = law.prepare(model, fiber, observation, reference, curvature)
-        targets = PathTarget(reference, curvature, turns)
+        targets = PathTarget(reference, curvature)
         first = jax.tree.map(lambda leaf: leaf[0], targets)
         law_control, _ = self._law_control(observation, first)
         # At the first step no control is known: assume that the law has driven.
@@ -271,14 +266,10 @@ class PathTracking(LawTask):
         it would stay in the plan when the observations are right again.
         """
         point, curvature, law = target.point, target.curvature, self.law
-        authority = jnp.ones(())
-        if isinstance(law, ModelLaw):
-            control, authority = law.control(target.turn, state, point, curvature)
-        else:
-            errors = path_errors(state, point, curvature)
-            control = law(errors, curvature, point[3])
-            if isinstance(law, RecoveringFeedback):
-                authority = law.authority(errors, point[3])
+        errors, authority = path_errors(state, point, curvature), jnp.ones(())
+        control = law(errors, curvature, point[3])
+        if isinstance(law, RecoveringFeedback):
+            authority = law.authority(errors, point[3])
         return jnp.clip(control, *self.box()), authority
 
 

@@ -203,6 +203,8 @@ class Shield(Stateful):
         dt: sampling period [s].
         rear: distance from the rear axle to the position of the vehicle [m], of which
             the slip is l κ at walking pace.
+        claimed: whether `width` and `tube` are known of the vehicle that it drives. If
+            they are those of a model in its place, `corridor` is NaN.
 
     Raises:
         ValueError: the model is not in path coordinates, or a setting is out of range.
@@ -223,6 +225,7 @@ class Shield(Stateful):
     conditions: Conditions = ANYWHERE
     dt: Positive = 0.1
     rear: NonNegative = 0.0
+    claimed: bool = True
 
     def __post_init__(self) -> None:
         if not self.model.along_path:
@@ -315,6 +318,7 @@ class Shield(Stateful):
         usual = jnp.where(holds, corridor, jnp.nan)
         rolls = self._slow(coordinates, road[0]) & known & ~holds
         corridor = jnp.where(rolls, state.rolling, usual)
+        claim = corridor if self.claimed else jnp.full_like(corridor, jnp.nan)
         report: Any = {
             **info,
             **flags,
@@ -323,9 +327,9 @@ class Shield(Stateful):
             "perturbation": chosen.nu,
             "braking": braking,
             "feasible": feasible,
-            "corridor": corridor,
+            "corridor": claim,
             "rolling": jnp.where(rolls, corridor - self.width - self.tube, 0.0),
-            "shield_healthy": jnp.isfinite(corridor),
+            "shield_healthy": jnp.isfinite(claim),
             "healthy": usable & holds & (intervention == 0.0),
         }
         # A latent that is not finite would stay so: the nominal model starts anew.
