@@ -21,6 +21,7 @@ SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
 CORE = {"types", "geometry", "rollout", "ranges", "paths", "lanes"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "doctor", "demo"}
+COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
 PLANT = CORE | {"plants", "scenarios"}
 PARTS = PLANT | {"control", "data"}

@@ -13,7 +13,8 @@ from composing import settings
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import build, evaluate, plants
+from sfkd_jax import build, collect, evaluate, plants
+from sfkd_jax.data import recorder
 from sfkd_jax.experiment import data, identified, runs, stages
 
 sys.path.append(str(Path(__file__).parent / "data"))
@@ -233,4 +234,98 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
 def test_logs_that_make_no_vehicle_are_refused_in_one_line(driven, more, says):
     with pytest.raises(ValueError, match=says) as refused:
         logged(driven, *more)
+    assert "\n" not in str(refused.value)
+
+
+SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained" / "kinematic_path"
+
+
+def drive_under(policy, act, car, path, seed, seconds=6.0):
+    """A run of a policy on a car, as its user records it."""
+    state = policy.controller.init(jax.random.key(seed))
+    with recorder(policy, path) as record:
+
+        def step(observation, env, reference):
+            nonlocal state
+            env = np.float32(env)
+            control, state, info = act(
+                policy.params, state, observation, env, reference
+            )
+            record(observation, env, control, info)
+            return control
+
+        box = ([0.4, -5], [0.9, 5])
+        for _ in drive(car, step, box, seconds=seconds, seed=seed):
+            pass
+
+
+@pytest.fixture(scope="module")
+def under_policy(tmp_path_factory):
+    """A run directory, and five runs of the car under its policy."""
+    root, car = tmp_path_factory.mktemp("collect"), Car()
+    folder = root / "car" / "sfkd_path" / "seed=0"
+    shutil.copytree(SHIPPED, folder)
+    policy = sfkd_jax.load(folder)
+    act = jax.jit(policy.controller.act)
+    for k in range(5):
+        drive_under(policy, act, car, root / "recorded" / f"{k}.csv", seed=k)
+    return root
+
+
+def collected(root, runs="recorded", level=0.8):
+    words = ("name=car", f"root={root}", f"collect.path={root / runs}")
+    return collect.run(settings(*words, f"certification.level={level}"))
+
+
+def test_runs_of_the_car_calibrate_its_corridor_again(under_policy, capsys):
+    made = collected(under_policy)
+    assert "after 5 runs: corridor" in (said := capsys.readouterr().err)
+    assert "at level 0.83" in said
+    folder = Path(made["certificate"]).parent
+    policy = sfkd_jax.load(folder)
+    before = json.loads((folder / "certificate.json").read_text())["corridor"]
+    claim = policy.certificate["recorded"]
+    assert claim["conditions"]["runs"] == 5
+    assert claim["corridor_m"] == made["corridor_m"]
+    assert claim["bounds"]["nominal"] >= before["bounds"]["nominal"]
+    assert made["conditions"]["lateral_m"] <= made["corridor_m"]
+    assert "of 5 runs of the car" in repr(policy)
+    collected(under_policy)
+    assert "is replaced" in capsys.readouterr().err
+
+
+def changed(rows, kind):
+    """Rows of a run that is not usable."""
+    names = rows[0].split(",")
+    table = [row.split(",") for row in rows[1:]]
+    if kind == "nan":
+        table[3][names.index("e_y")] = "nan"
+    if kind == "law":
+        for row in table:
+            row[names.index("steering")] = "0.1"
+    kept = [k for k, name in enumerate(names) if (name, kind) != ("wind", "no e")]
+    return [",".join(row[k] for k in kept) for row in [names, *table]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("none", "no .csv, .npz, .parquet in this folder"),
+        ("few", "5 runs are too few for certification.level=0.9: .*level=0.83"),
+        ("no e", "no column wind among"),
+        ("law", "in 100% of the steps the control is not that of the law"),
+        ("nan", "e_y is nan"),
+        ("twice", "two runs are the same"),
+    ],
+)
+def test_runs_that_calibrate_nothing_are_refused_in_one_line(under_policy, kind, says):
+    folder = under_policy / kind
+    folder.mkdir()
+    for file in [*(under_policy / "recorded").iterdir()] * (kind != "none"):
+        rows = changed(file.read_text().splitlines(), kind)
+        (folder / file.name).write_text("\n".join(rows) + "\n")
+    if kind == "twice":
+        shutil.copy(folder / "0.csv", folder / "5.csv")
+    with pytest.raises(ValueError, match=says) as refused:
+        collected(under_policy, kind, level=0.9 if kind == "few" else 0.8)
     assert "\n" not in str(refused.value)

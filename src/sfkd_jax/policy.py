@@ -24,7 +24,8 @@ from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Model, Params
 
 KIND, LAW = "policy", "law"
-CERTIFICATE = "certificate.json"
+CERTIFICATE, RECORDED = "certificate.json", "certificate.runs.json"
+"""Of a run, and with the corridor of recorded runs, which comes first."""
 
 
 UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
@@ -142,11 +143,11 @@ class Policy(TrainedModel):
         told = _ranges(names, *([speed, *corner] for speed, corner in ends))
         dwell = "{:g} to {:g} s".format(*under["dwell_s"])
         yield f"under: {told}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
-        if not build.is_claimed(document):
-            yield (
-                "of a model of its logs, not of the car: nothing is claimed of that "
-                "before sfkd collect"
-            )
+        if made := document.get("recorded"):
+            number, width = made["conditions"]["runs"], f"{made['corridor_m']:.3f} m"
+            yield f"of {number} runs of the car: {width} at level {made['level']:g}"
+        elif not build.is_claimed(document):
+            yield "of a model of logs, not of the car, about which nothing is claimed"
 
     def _with_corridor(self) -> dict[str, Any]:
         """Return the certificate; a ValueError says that it has no corridor."""
@@ -422,9 +423,16 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
 
 
 def read_certificate(
-    path: str | Path, trained: TrainedModel
+    path: str | Path,
+    trained: TrainedModel,
+    names: tuple[str, ...] = (RECORDED, CERTIFICATE),
 ) -> tuple[dict[str, Any] | None, str]:
     """Verify the certificate beside a policy, in its run directory.
+
+    Args:
+        path: as of `load`.
+        trained: the policy.
+        names: of the files; the first that is there and about this policy.
 
     Returns:
         The certificate and "", or None and the reason why there is none.
@@ -434,21 +442,24 @@ def read_certificate(
     """
     from sfkd_jax import certification  # loaded only if there is something to verify
 
-    file = _file(path).with_name(CERTIFICATE)
-    if not file.exists():
-        return None, f"{CERTIFICATE} is missing"
-    document = store.read_json(file, keys=("valid",))
-    if document["valid"] is not True:
-        reason = store.one_line(document.get("reason"))
-        return None, f"the certificate was refused: {reason}"
-    try:
-        with store.as_artefact_error(file):
-            certification.verify_document(document, trained)
-    except certification.CertificateStale as reason:
-        return None, f"{reason}; certify again"
-    except certification.CertificationRefused as reason:
-        raise store.ArtefactError(f"{file}: {reason}") from None
-    return document, ""
+    reason = f"{CERTIFICATE} is missing"
+    for file in (_file(path).with_name(name) for name in names):
+        if not file.exists():
+            continue
+        document = store.read_json(file, keys=("valid",))
+        if document["valid"] is not True:
+            told = store.one_line(document.get("reason"))
+            return None, f"the certificate was refused: {told}"
+        try:
+            with store.as_artefact_error(file):
+                certification.verify_document(document, trained)
+        except certification.CertificateStale as stale:
+            reason = f"{stale}; certify again"
+        except certification.CertificationRefused as refused:
+            raise store.ArtefactError(f"{file}: {refused}") from None
+        else:
+            return document, ""
+    return None, reason
 
 
 @lru_cache(maxsize=8)

@@ -233,6 +233,7 @@ class ControllerInfo(TypedDict, total=False):
     constraints_kept: Bool[Array, ""]  # it is 0
     # along_reference
     path_state: Float[Array, " coordinate"]  # ξ; NaN where it is not known
+    road: Float[Array, " 2"]  # κ [1/m] and v_ref [m/s] of this step
     planned_path: Float[Array, "horizon coordinate"]  # predicted ξ of the chosen plan
     # Gate
     measured: Bool[Array, " coordinate"]  # which of ξ is measured, not predicted

@@ -23,6 +23,7 @@ from sfkd_jax.build._controllers import ControllerSettings as ControllerSettings
 from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import build_in_lane as build_in_lane
 from sfkd_jax.build._controllers import controller_horizon as controller_horizon
+from sfkd_jax.build._controllers import corridor_of as corridor_of
 from sfkd_jax.build._controllers import in_corridor as in_corridor
 from sfkd_jax.build._controllers import is_claimed as is_claimed
 from sfkd_jax.data import Columns, Driver, from_logs

@@ -331,7 +331,7 @@ def in_corridor(
         law: around which the model was learned.
         certificate: with a corridor.
     """
-    corridor = certificate["corridor"]
+    corridor = corridor_of(certificate)
     bounds, sensors = corridor["bounds"], _sensors(corridor)
     # What the heading's noise moves the car sideways until the law has turned it back.
     ratio = float(np.max(law.gain[..., 0, HEADING] / law.gain[..., 0, LATERAL]))
@@ -351,6 +351,13 @@ def in_corridor(
         rear=_rear(law),
         claimed=is_claimed(certificate),
     ).controller()
+
+
+def corridor_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
+    """The corridor of a certificate, with the bounds of recorded runs if it has any."""
+    corridor, runs = certificate["corridor"], certificate.get("recorded", {})
+    measured = ("bounds", "corridor_m", "level")
+    return corridor | {name: runs[name] for name in measured if name in runs}
 
 
 def is_claimed(certificate: Mapping[str, Any]) -> bool:
@@ -403,7 +410,7 @@ def build_in_lane(
         planner: that searches for a reference, in `PLANNERS`.
         friction: entry of e that is the friction; None if none is.
     """
-    corridor, road = certificate["corridor"], certificate["boxes"]["control"]
+    corridor, road = corridor_of(certificate), certificate["boxes"]["control"]
     under, state = corridor["conditions"], _conditions(certificate).state
     kind = control.Class(
         curvature=min(under["peak_curvature"], road[1][CURVATURE]),
@@ -452,7 +459,8 @@ def _conditions(
     the runs on which a corridor is calibrated leave them as well.
     """
     if certificate:
-        corridor, boxes = certificate.get("corridor"), certificate["boxes"]
+        corridor = certificate.get("corridor") and corridor_of(certificate)
+        boxes = certificate["boxes"]
         low, high = (np.asarray(side, float) for side in boxes["state"])
         margin = STATE_MARGIN * (high - low)
         edge = 0.0

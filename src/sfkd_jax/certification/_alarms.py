@@ -20,9 +20,9 @@ from sfkd_jax.control import (
     turning_rate,
 )
 from sfkd_jax.data import sensor_keys
-from sfkd_jax.geometry import HEADING, PERTURBATION
+from sfkd_jax.geometry import HEADING, LATERAL, PERTURBATION
 from sfkd_jax.plants import Vehicle, along_path
-from sfkd_jax.rollout import fold
+from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -94,6 +94,30 @@ def spread_of(noise: tuple[float, ...], size: int) -> Array:
     """
     known = noise[1 : size - 2]
     return jnp.zeros(size).at[3 : 3 + len(known)].set(jnp.asarray(known))
+
+
+def simulate_nominal(
+    loop: Loop, runs: Trajectory, key: Key
+) -> tuple[Float[Array, "run time"], Float[Array, "run rank"]]:
+    """Return ê_y of a nominal model that starts at the true state, and z_0 − ẑ_0.
+
+    ẑ_0 is the latent state of a nominal model that starts at the measured state.
+    """
+    model, spread = loop.model, spread_of(loop.noise, runs.states.shape[-1])
+
+    def lateral(run: Trajectory) -> Array:
+        return rollout(model, loop.params, run)[0][:, BODY][:, LATERAL]
+
+    def gap(state: State, env: Environment, key: Key) -> Array:
+        fiber = model.fiber(loop.params, env)
+        measured = state + spread * jax.random.normal(key, state.shape)
+        # The nominal model starts at what sensors show, the car at the truth.
+        starts = model.encode(fiber, measured), model.encode(fiber, state)
+        return model.vector(starts[0]) - model.vector(starts[1])
+
+    keys = jax.random.split(key, len(runs.states))
+    gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
+    return jax.vmap(lateral)(runs), gaps
 
 
 def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:

@@ -164,6 +164,8 @@ def schema(
         # Simulated runs have a corridor; logs have no plant to drive.
         if _is_simulated(trained):
             rules["corridor"] = _corridor(document, trained)
+        if "recorded" in document:
+            rules["recorded"] = _recorded(document)
     # What `certify` was asked for, if it was asked by a command.
     if "certification" in document:
         rules["certification"] = _asked_for(document)
@@ -353,6 +355,22 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
         # No farther than the runs of the attack reach.
         "shield_horizon": Measured(1, LENGTH, int),
         "seconds": SECONDS,
+    }
+
+
+def _recorded(document: Mapping[str, Any]) -> Rule:
+    """The corridor of recorded runs, at a level that so many can support."""
+    stated, width = document["recorded"], document["corridor"]["bounds"]["nominal"]
+    bounds, count = stated["bounds"], stated["conditions"]["runs"]
+    conditions = {"runs": COUNT, "contents": TEXT, "duration_s": POSITIVE}
+    return {
+        "bounds": dict.fromkeys(JOINT, POSITIVE) | {"nominal": Measured(width)},
+        "corridor_m": Follows(
+            bounds["nominal"] + bounds["vehicle_to_nominal_position"]
+        ),
+        "level": Measured(SMALLEST, count / (count + 1)),
+        "before": _covered(stated["before"], *[Follows(count)] * 2),
+        "conditions": conditions | {"lateral_m": Measured()},
     }
 
 

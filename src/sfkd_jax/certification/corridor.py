@@ -24,12 +24,13 @@ from sfkd_jax.certification._alarms import (
     calibrate_innovations,
     innovations,
     sensor_effect,
-    spread_of,
+    simulate_nominal,
 )
 from sfkd_jax.certification._alarms import closed_loop as closed_loop
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
-from sfkd_jax.certification._measured import residuals
+from sfkd_jax.certification._measured import conformal_bounds, residuals
+from sfkd_jax.certification._measured import supports as supports
 from sfkd_jax.certification._tubes import (
     ALONE,
     FORMS,
@@ -42,7 +43,6 @@ from sfkd_jax.control import safety_filter
 from sfkd_jax.data import drive_along_path, from_s3
 from sfkd_jax.geometry import LATERAL, path_state
 from sfkd_jax.ranges import Interval, Span
-from sfkd_jax.rollout import rollout
 from sfkd_jax.scenarios import DRIVES, DriveClass, random_switching
 from sfkd_jax.types import (
     BODY,
@@ -50,7 +50,6 @@ from sfkd_jax.types import (
     Environment,
     Key,
     Params,
-    State,
     Trajectory,
 )
 
@@ -153,7 +152,7 @@ def certify_corridor(
         _driver, loop, limits, excited, jnp.repeat(jnp.arange(len(DRIVES)), runs)
     )
     kinds = [runs_of(switching)] * 3 + [runs_of(from_s3(steps, dt, low, high))]
-    simulate = jax.jit(partial(_simulate_nominal, loop))
+    simulate = jax.jit(partial(simulate_nominal, loop))
     keys = zip(kinds, run_keys, jax.random.split(sensor_key, 4), strict=True)
     measured = [
         _measure(loop, claims, simulate, kind(run_key), key)
@@ -200,6 +199,48 @@ def certify_corridor(
     }
 
 
+def scores_of_runs(
+    loop: Loop, document: Mapping[str, Any], runs: Trajectory
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores of recorded runs and their e_y (run, time), as those of simulated ones.
+
+    The state of a vehicle is what its sensors show, also to the nominal model.
+    """
+    claims = {
+        name: OutputMetric.from_document(part)
+        for name, part in document["outputs"].items()
+    }
+    simulate = jax.jit(partial(simulate_nominal, loop))
+    lateral, _, scores = _measure(loop, claims, simulate, runs, jax.random.key(0))
+    return scores, lateral
+
+
+def calibrate_on_runs(
+    document: Mapping[str, Any], scores: np.ndarray, level: float
+) -> dict[str, Any]:
+    """Return the part `recorded` of a certificate: the bounds of recorded runs.
+
+    Units are the bounds of the document, which these runs did not make. The filter
+    keeps the width with which they were driven.
+
+    Args:
+        document: with a corridor.
+        scores: of `scores_of_runs`.
+        level: 1 − δ, at most n/(n + 1) for n runs.
+    """
+    before = document["corridor"]["bounds"]
+    units = np.asarray([[before[name] for name in JOINT]])
+    found = conformal_bounds(units, scores[:, : len(JOINT)], level=level)
+    bounds = dict(zip(JOINT, found.tolist(), strict=True))
+    bounds["nominal"] = max(bounds["nominal"], before["nominal"])
+    return {
+        "bounds": bounds,
+        "corridor_m": bounds["nominal"] + bounds["vehicle_to_nominal_position"],
+        "level": level,
+        "before": corridor_coverage(before, scores),
+    }
+
+
 def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a data set that say which drives a corridor is about."""
     return {name: data[name] for name in ROAD_SETTINGS}
@@ -238,7 +279,7 @@ def _measure(
 
     Scores are the smallest bounds that would have held on a run, `JOINT` and `ALONE`.
     Where a simulator failed, none would have: the run counts as one outside.
-    `simulate` is `_simulate_nominal`, compiled once for all batches of one size.
+    `simulate` is `simulate_nominal`, compiled once for all batches of one size.
     """
     nominal, start = (np.asarray(part, np.float64) for part in simulate(runs, key))
     errors = residuals(loop.model, loop.params, runs)
@@ -258,30 +299,6 @@ def _seen(runs_of: Callable[[Key], Trajectory], observe: Any, key: Key) -> Any:
     rows = np.resize(np.flatnonzero(kept), len(runs.states))
     rows = np.where(kept, np.arange(len(rows)), rows)
     return jax.tree.map(lambda leaf: leaf[rows], observe(runs, key))
-
-
-def _simulate_nominal(
-    loop: Loop, runs: Trajectory, key: Key
-) -> tuple[Float[Array, "run time"], Float[Array, "run rank"]]:
-    """Return ê_y of a nominal model that starts at the true state, and z_0 − ẑ_0.
-
-    ẑ_0 is the latent state of a nominal model that starts at the measured state.
-    """
-    model, spread = loop.model, spread_of(loop.noise, runs.states.shape[-1])
-
-    def lateral(run: Trajectory) -> Array:
-        return rollout(model, loop.params, run)[0][:, BODY][:, LATERAL]
-
-    def gap(state: State, env: Environment, key: Key) -> Array:
-        fiber = model.fiber(loop.params, env)
-        measured = state + spread * jax.random.normal(key, state.shape)
-        # The nominal model starts at what sensors show, the car at the truth.
-        starts = model.encode(fiber, measured), model.encode(fiber, state)
-        return model.vector(starts[0]) - model.vector(starts[1])
-
-    keys = jax.random.split(key, len(runs.states))
-    gaps = jax.vmap(gap)(runs.states[:, 0], runs.envs[:, 0], keys)
-    return jax.vmap(lateral)(runs), gaps
 
 
 Runs: TypeAlias = tuple[Array, Array]

@@ -222,6 +222,17 @@ class DemoSettings:
 
 
 @takes()
+class CollectSettings:
+    """The runs that `collect` reads.
+
+    Attributes:
+        path: a file, a folder or a glob.
+    """
+
+    path: str
+
+
+@takes()
 class Settings:
     """All settings of a command, see conf/config.yaml."""
 
@@ -241,6 +252,7 @@ class Settings:
     comparison: ComparisonSettings
     export: ExportSettings
     demo: DemoSettings
+    collect: CollectSettings
 
     @property
     def run_dir(self) -> Path:
@@ -323,8 +335,8 @@ def register() -> None:
         "dataset": datasets,
     }
     for group, hint in get_type_hints(Settings).items():
-        # Of `demo` the primary config has the values itself.
-        if not is_dataclass(hint) or group == "demo":
+        # Of commands the primary config has the values itself.
+        if not is_dataclass(hint) or group in ("demo", "collect"):
             continue
         for variant, kind in variants.get(group, {"": hint}).items():
             ConfigStore.instance().store(

@@ -88,8 +88,8 @@ class AlongReference(Stateful):
         inner: `act` takes ξ and a `Preview` in place of observation and reference.
         coordinates: size of ξ.
 
-    `info` gains `path_state` (ξ, NaN where observation or reference are not finite) and
-        `planned_path` (predicted ξ).
+    `info` gains `path_state` (ξ, NaN where observation or reference are not finite),
+        `road` (κ and v_ref of this step, likewise) and `planned_path` (predicted ξ).
     """
 
     inner: Controller
@@ -134,7 +134,7 @@ class AlongReference(Stateful):
         planned = info["predicted_states"]
         # A gate has already said which of ξ is believed.
         info: Any = {"path_state": xi, **info, "planned_path": planned}
-        info["precision"] = precise
+        info |= {"precision": precise, "road": road[0]}
         if "healthy" in info:
             info["healthy"] &= precise & known
         info["predicted_states"] = jax.vmap(beside)(planned, reference)
