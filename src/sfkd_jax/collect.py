@@ -4,28 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import policy, store
 from sfkd_jax.certification.corridor import (
     calibrate_on_runs,
+    check_count,
     closed_loop,
+    corridor_coverage,
     scores_of_runs,
-    supports,
 )
-from sfkd_jax.data import RecordedRuns, recorded_runs
+from sfkd_jax.data import recorded_runs
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.types import BODY, Trajectory
 
 COUNTS = (5, 10, 20)
 """Numbers of runs of which the corridor is printed."""
-FITS, UNFIT = 0.01, 0.01
-"""A control is that of the law if they differ by less than this share of the largest ν;
-on so large a share of the steps it may be another.
-"""
 
 
 def run(settings: Settings) -> dict[str, Any]:
@@ -38,19 +32,17 @@ def run(settings: Settings) -> dict[str, Any]:
             f"{folder}: nothing to calibrate again, "
             f"{reason or 'its certificate has no corridor'}"
         )
-    where, dt = settings.collect.path, trained.vehicle.dt
-    recorded = recorded_runs(where, trained)
-    runs = _under_law(recorded, trained)
+    runs, contents = recorded_runs(settings.collect.path, trained)
     count, steps = runs.controls.shape[:2]
-    if not supports(count, level):
-        possible = int(100 * count / (count + 1)) / 100
-        raise ValueError(
-            f"{where}: {count} runs are too few for certification.level={level:g}: "
-            f"record more, or pass certification.level={possible:g}"
-        )
-    store.print_message(f"{count} runs, cut to the shortest, {steps * dt:g} s")
+    seconds = steps * trained.vehicle.dt
+    check_count(count, level, "runs")
     parts = trained.vehicle, trained.model, trained.params, trained.law
     scores, lateral = scores_of_runs(closed_loop(*parts, ()), document, runs)
+    inside = corridor_coverage(document["corridor"]["bounds"], scores)["coverage"]
+    store.print_message(
+        f"{count} runs, cut to the shortest, {seconds:g} s; "
+        f"{inside:.0%} of them inside the bounds of the certificate"
+    )
     for some in (number for number in COUNTS if number <= count):
         at = some / (some + 1) - 1e-9
         made = calibrate_on_runs(document, scores[:some], at)
@@ -60,8 +52,8 @@ def run(settings: Settings) -> dict[str, Any]:
     made = calibrate_on_runs(document, scores, level)
     made["conditions"] = {
         "runs": count,
-        "contents": recorded.contents,
-        "duration_s": steps * dt,
+        "contents": contents,
+        "duration_s": seconds,
         "lateral_m": float(np.max(np.abs(lateral))),
     }
     path = folder / policy.RECORDED
@@ -69,30 +61,6 @@ def run(settings: Settings) -> dict[str, Any]:
         store.print_message(f"{path} is replaced")
     store.write_json(path, document | {"recorded": made})
     return {"certificate": str(path), **made}
-
-
-def _under_law(recorded: RecordedRuns, trained: policy.TrainedModel) -> Trajectory:
-    """Return the runs with the ν that acted, if the law of the policy drove them."""
-    law, plant, box = trained.law, trained.vehicle, trained.settings["environment"]
-    assert law is not None
-    low, high = jnp.asarray(box["low"]), jnp.asarray(box["high"])
-
-    def control(xi: Any, inputs: Any, env: Any) -> Any:
-        return law(xi, inputs[2], inputs[3], jnp.clip(env, low, high))
-
-    states, inputs, envs = recorded.runs
-    alone = jax.jit(jax.vmap(jax.vmap(control)))(states[:, :-1, BODY], inputs, envs)
-    expected = np.clip(alone + inputs[..., :2], plant.control_low, plant.control_high)
-    off = np.abs(recorded.controls - expected) > FITS * np.asarray(law.perturbation)
-    off = np.any(off, axis=-1)
-    worst = int(np.argmax(off.mean(axis=1)))
-    if (share := off[worst].mean()) > UNFIT:
-        raise ValueError(
-            f"{recorded.sources[worst]}: in {share:.0%} of the steps the control is "
-            "not that of the law of this policy plus nu: another law has driven"
-        )
-    nu = jnp.where(off[..., None], recorded.controls - alone, inputs[..., :2])
-    return recorded.runs._replace(controls=inputs.at[..., :2].set(nu))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
@@ -25,9 +25,8 @@ from sfkd_jax.types import Controller, Key, Model, Params
 
 KIND, LAW = "policy", "law"
 CERTIFICATE, RECORDED = "certificate.json", "certificate.runs.json"
-"""Of a run, and with the corridor of recorded runs, which comes first."""
-
-
+CERTIFICATES = (RECORDED, CERTIFICATE)
+"""That with the corridor of recorded runs comes first."""
 UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
 FRICTION_AND_WIND = ["friction [-]", "lateral wind [m/s]"]
 UNITS |= {"yaw": "[rad]", "yaw_rate": "[rad/s]", "steering": "[rad]"}
@@ -425,14 +424,9 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
 def read_certificate(
     path: str | Path,
     trained: TrainedModel,
-    names: tuple[str, ...] = (RECORDED, CERTIFICATE),
+    names: Sequence[str] = (RECORDED, CERTIFICATE),
 ) -> tuple[dict[str, Any] | None, str]:
-    """Verify the certificate beside a policy, in its run directory.
-
-    Args:
-        path: as of `load`.
-        trained: the policy.
-        names: of the files; the first that is there and about this policy.
+    """Verify the certificate beside a policy, the first of these files that exists.
 
     Returns:
         The certificate and "", or None and the reason why there is none.
@@ -442,24 +436,22 @@ def read_certificate(
     """
     from sfkd_jax import certification  # loaded only if there is something to verify
 
-    reason = f"{CERTIFICATE} is missing"
-    for file in (_file(path).with_name(name) for name in names):
-        if not file.exists():
-            continue
-        document = store.read_json(file, keys=("valid",))
-        if document["valid"] is not True:
-            told = store.one_line(document.get("reason"))
-            return None, f"the certificate was refused: {told}"
-        try:
-            with store.as_artefact_error(file):
-                certification.verify_document(document, trained)
-        except certification.CertificateStale as stale:
-            reason = f"{stale}; certify again"
-        except certification.CertificationRefused as refused:
-            raise store.ArtefactError(f"{file}: {refused}") from None
-        else:
-            return document, ""
-    return None, reason
+    files = [_file(path).with_name(name) for name in names]
+    file = next((file for file in files if file.exists()), None)
+    if file is None:
+        return None, f"{CERTIFICATE} is missing"
+    document = store.read_json(file, keys=("valid",))
+    if document["valid"] is not True:
+        reason = store.one_line(document.get("reason"))
+        return None, f"the certificate was refused: {reason}"
+    try:
+        with store.as_artefact_error(file):
+            certification.verify_document(document, trained)
+    except certification.CertificateStale as reason:
+        return None, f"{reason}; certify again"
+    except certification.CertificationRefused as reason:
+        raise store.ArtefactError(f"{file}: {reason}") from None
+    return document, ""
 
 
 @lru_cache(maxsize=8)

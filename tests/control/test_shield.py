@@ -202,6 +202,13 @@ def test_who_asks_for_little_is_left_alone():
     np.testing.assert_array_equal(controls, planned)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
     assert not np.any(info["intervention"])
+    # Of bounds that are not the vehicle's own nothing is claimed, and all is driven.
+    _, again, info = jit(partial(drive, filtered(claimed=False)))(
+        script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
+    )
+    np.testing.assert_array_equal(again, controls)
+    assert np.all(np.isnan(info["corridor"]))
+    assert not np.any(info["shield_healthy"])
 
 
 def margin_of(xi, nu, road):
@@ -427,13 +434,9 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     made, shield = {}, control.Shield
     record = lambda **options: made.update(options) or shield(**options)
     monkeypatch.setattr(control, "Shield", record)
-    build.in_corridor(
-        scripted(),
-        TOY,
-        kinematic(),
-        LAW,
-        {"corridor": corridor, "boxes": boxes, "alpha": 0.9},
-    )
+    certificate = {"corridor": corridor, "boxes": boxes, "alpha": 0.9}
+    build_with = partial(build.in_corridor, scripted(), TOY, kinematic(), LAW)
+    build_with(certificate)
     low, high = made["conditions"].state
     # Other coordinates have the box of the data and a quarter of its width.
     assert low == pytest.approx((-0.17, -0.15, 6.0))
@@ -441,6 +444,14 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     assert boxes["state"][0][0] == -0.05
     expected = (0.08, 0.06, pytest.approx(0.03))
     assert (made["width"], made["tube"], made["noise_allowance"]) == expected
+    # Measured on a model of logs, it claims nothing of the car before its own runs do.
+    corridor["conditions"]["identified_from"] = "contents"
+    build_with(certificate)
+    assert not made["claimed"]
+    bounds = {"nominal": 0.08, "vehicle_to_nominal_position": 0.1}
+    recorded = {"bounds": bounds, "corridor_m": 0.18, "level": 0.8, "conditions": {}}
+    build_with(certificate | {"recorded": recorded})
+    assert (made["claimed"], made["tube"]) == (True, 0.1)
 
 
 BOX = Conditions(state=((-0.3, -0.1, 8.0), (0.3, 0.1, 10.0)))

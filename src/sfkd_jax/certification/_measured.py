@@ -91,10 +91,7 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
     """
     if np.any(np.isnan(scores)):
         raise ValueError("residuals are not finite")
-    if not supports(len(scores), level):
-        raise ValueError(
-            f"{len(scores)} calibration trajectories are too few for level {level}"
-        )
+    check_count(len(scores), level, "calibration trajectories")
     # (n + 1): the new trajectory counts as one of the exchangeable ones.
     found = float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
     # Too many runs without a bound: there is none at this level.
@@ -109,6 +106,17 @@ def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -
 def supports(count: int, level: float) -> bool:
     """Whether `count` scores suffice for a conformal quantile: ⌈(n+1) level⌉ ≤ n."""
     return math.ceil((count + 1) * level) <= count
+
+
+def check_count(count: int, level: float, what: str) -> None:
+    """Refuse a level that `count` scores, of so many `what`, do not support."""
+    if not supports(count, level):
+        # Rounded down, so that the proposed level is accepted.
+        highest = math.floor(100 * count / (count + 1)) / 100
+        raise ValueError(
+            f"{count} {what} are too few for certification.level={level:g}: "
+            f"record more, or pass certification.level={highest:g}"
+        )
 
 
 def holds_for(runs: int, level: float) -> str:

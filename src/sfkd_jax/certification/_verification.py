@@ -55,7 +55,6 @@ REACH = 100.0
 LABELS = (*SCENARIOS, "s1", "s2")
 """Parts of the test runs by name; the last two are halves, in order of generation."""
 
-
 Trained: TypeAlias = Any
 """A `policy.TrainedModel`: what a certificate is about."""
 
@@ -315,8 +314,7 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
     width = bounds["nominal"] + tube
     # Where all bounds held on all runs, nothing farther was seen.
     covered = corridor["coverage"] == 1.0
-    kinds = (*JOINT, *ALONE)
-    everywhere = len(DRIVES) * corridor["runs"]
+    kinds, everywhere = (*JOINT, *ALONE), len(DRIVES) * corridor["runs"]
     bounds_of: dict[str, Any] = {"bounds": dict.fromkeys(kinds, POSITIVE)}
     parts = [corridor["by_group"][name] for name in DRIVES]
     rules = [bounds_of | _covered(part, runs, runs) for part in parts]
@@ -360,17 +358,15 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
 
 def _recorded(document: Mapping[str, Any]) -> Rule:
     """The corridor of recorded runs, at a level that so many can support."""
-    stated, width = document["recorded"], document["corridor"]["bounds"]["nominal"]
-    bounds, count = stated["bounds"], stated["conditions"]["runs"]
-    conditions = {"runs": COUNT, "contents": TEXT, "duration_s": POSITIVE}
+    bounds, about = map(document["recorded"].get, ("bounds", "conditions"))
+    width, count = document["corridor"]["bounds"]["nominal"], about["runs"]
+    measured = dict.fromkeys(("duration_s", "lateral_m"), POSITIVE)
+    tube = bounds["vehicle_to_nominal_position"]
     return {
         "bounds": dict.fromkeys(JOINT, POSITIVE) | {"nominal": Measured(width)},
-        "corridor_m": Follows(
-            bounds["nominal"] + bounds["vehicle_to_nominal_position"]
-        ),
+        "corridor_m": Follows(bounds["nominal"] + tube),
         "level": Measured(SMALLEST, count / (count + 1)),
-        "before": _covered(stated["before"], *[Follows(count)] * 2),
-        "conditions": conditions | {"lateral_m": Measured()},
+        "conditions": {"runs": COUNT, "contents": TEXT} | measured,
     }
 
 
@@ -405,7 +401,6 @@ def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
     given = drive_class(data) | {name: data[name] for name in EXCITATION}
     given["law_model"] = data["law"]["model"]
     dwell, dt = stated["dwell_s"], settings["vehicle"]["dt"]
-    # The vehicle that was driven is a model of these logs.
     if contents := settings["vehicle"].get("contents"):
         given["identified_from"] = contents
     return {

@@ -29,8 +29,8 @@ from sfkd_jax.certification._alarms import (
 from sfkd_jax.certification._alarms import closed_loop as closed_loop
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.certification._claims import OUTPUTS, OutputMetric
+from sfkd_jax.certification._measured import check_count as check_count
 from sfkd_jax.certification._measured import conformal_bounds, residuals
-from sfkd_jax.certification._measured import supports as supports
 from sfkd_jax.certification._tubes import (
     ALONE,
     FORMS,
@@ -218,15 +218,10 @@ def scores_of_runs(
 def calibrate_on_runs(
     document: Mapping[str, Any], scores: np.ndarray, level: float
 ) -> dict[str, Any]:
-    """Return the part `recorded` of a certificate: the bounds of recorded runs.
+    """Return the part `recorded` of a certificate, from `scores_of_runs` at 1 − δ.
 
     Units are the bounds of the document, which these runs did not make. The filter
     keeps the width with which they were driven.
-
-    Args:
-        document: with a corridor.
-        scores: of `scores_of_runs`.
-        level: 1 − δ, at most n/(n + 1) for n runs.
     """
     before = document["corridor"]["bounds"]
     units = np.asarray([[before[name] for name in JOINT]])
@@ -237,7 +232,6 @@ def calibrate_on_runs(
         "bounds": bounds,
         "corridor_m": bounds["nominal"] + bounds["vehicle_to_nominal_position"],
         "level": level,
-        "before": corridor_coverage(before, scores),
     }
 
 

@@ -24,6 +24,5 @@ from sfkd_jax.data._generation import generate_open_loop as generate_open_loop
 from sfkd_jax.data._generation import segment_scenarios as segment_scenarios
 from sfkd_jax.data._generation import sensor_keys as sensor_keys
 from sfkd_jax.data._logs import Columns as Columns
-from sfkd_jax.data._recorded import RecordedRuns as RecordedRuns
 from sfkd_jax.data._recorded import recorded_runs as recorded_runs
 from sfkd_jax.data._recorded import recorder as recorder

@@ -6,38 +6,27 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from sfkd_jax.data._checks import more
 from sfkd_jax.data._from_logs import fingerprint, log_files
 from sfkd_jax.data._logs import Columns, Log, read_logs
-from sfkd_jax.types import BODY, Trajectory
+from sfkd_jax.geometry import PathState
+from sfkd_jax.types import BODY, Control, Environment, Trajectory
 
 ERRORS = ("e_y", "e_psi")
 INPUTS = ("nu_1", "nu_2", "curvature", "v_ref")
 """Columns of a recorded run beside those of a log: the first of ξ, and w."""
 LATE = 0.2
 """Part of a period by which a row may be early or late."""
-
-
-class RecordedRuns(NamedTuple):
-    """Runs in path coordinates, cut to the shortest of them.
-
-    Attributes:
-        runs: states (run, time + 1, 3 + coordinate), w (run, time, 4), e.
-        controls: of the vehicle, (run, time, 2).
-        contents: hash of the files.
-        sources: file of each run.
-    """
-
-    runs: Trajectory
-    controls: Float[np.ndarray, "run time 2"]
-    contents: str
-    sources: list[str]
+FITS, UNFIT = 0.01, 0.01
+"""A control is that of a law if they differ by less than this share of the largest ν;
+on so large a share of the steps it may be another.
+"""
 
 
 def run_columns(trained: Any) -> Columns:
@@ -71,12 +60,10 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
         file.write(",".join(names) + "\n")
 
         def record(
-            observation: Any,
-            env: Any,
-            control: Any,
-            info: Any,
-            time: float | None = None,
+            observation: Any, env: Any, control: Any, info: Any, time: Any = None
         ) -> None:
+            if "perturbation" not in info:
+                raise ValueError("only a policy with a shield has runs to collect")
             time = dt * next(rows) if time is None else time
             row = [time, *observation, *info["path_state"][:2], *control, *env[:size]]
             row += [*info["perturbation"], *info["road"]]
@@ -85,8 +72,11 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
         yield record
 
 
-def recorded_runs(path: str, trained: Any) -> RecordedRuns:
-    """Read the runs of a policy that `recorder` wrote, or refuse them with a reason.
+def recorded_runs(path: str, trained: Any) -> tuple[Trajectory, str]:
+    """Return the runs of a policy that `recorder` wrote, and the hash of their files.
+
+    They are in path coordinates, and cut to the shortest. Runs that another law drove,
+    or that lack a number, are refused with the reason.
 
     Args:
         path: a file, a folder or a glob.
@@ -97,25 +87,50 @@ def recorded_runs(path: str, trained: Any) -> RecordedRuns:
     if len({digest for digest, _ in files}) < len(files):
         raise ValueError(f"{path}: two runs are the same, and count once; remove one")
     names = [file for _, file in files]
-    logs, errors, _ = read_logs(names, columns, dt=dt, needs_environment=True)
-    if errors:
-        raise ValueError(errors[0])
+    logs, wrong, _ = read_logs(names, columns, dt=dt, needs_environment=True)
+    if wrong:
+        raise ValueError(wrong[0])
     for log in logs:
         _check(log, columns, dt)
-    steps = min(len(log.time) for log in logs) - 1
-    size, env = len(columns.state) - len(ERRORS), len(columns.environment) - len(INPUTS)
+    steps = min(len(log.time) for log in logs)
     states, controls, given = (
-        np.stack([np.asarray(getattr(log, name)[: steps + 1]) for log in logs])
+        np.stack([np.asarray(getattr(log, name)[:steps]) for log in logs])
         for name in ("states", "controls", "envs")
     )
-    still = np.zeros((*states.shape[:2], BODY.start))
-    parts = still, states[..., size:], states[..., BODY.start : size]
-    xi = np.concatenate(parts, axis=-1)
-    given = given[:, :-1]
-    arrays = xi, given[..., env:], given[..., :env]
-    runs = Trajectory(*(jnp.asarray(each, dtype=jnp.float32) for each in arrays))
-    sources = [log.source for log in logs]
-    return RecordedRuns(runs, controls[:, :-1], fingerprint(path), sources)
+    still, errors = np.zeros((*states.shape[:2], BODY.start)), states[..., -2:]
+    xi = np.concatenate([still, errors, states[..., BODY.start : -2]], axis=-1)
+    # What is done in the last row has no outcome.
+    env, inputs = np.split(given[:, :-1], [-len(INPUTS)], axis=-1)
+    if not env.shape[-1]:  # a policy that reads no e is given zeros
+        env = np.zeros((*env.shape[:2], len(trained.settings["space"]["env_mean"])))
+    arrays = (jnp.asarray(part, dtype=jnp.float32) for part in (xi, inputs, env))
+    runs, sources = Trajectory(*arrays), [log.source for log in logs]
+    return _under_law(runs, controls[:, :-1], trained, sources), fingerprint(path)
+
+
+def _under_law(
+    runs: Trajectory, controls: np.ndarray, trained: Any, sources: list[str]
+) -> Trajectory:
+    """Return the runs with the ν that acted, if the law of the policy drove them."""
+    plant, box = trained.vehicle, trained.settings["environment"]
+    low, high = jnp.asarray(box["low"]), jnp.asarray(box["high"])
+
+    def control(xi: PathState, inputs: Control, env: Environment) -> Control:
+        return trained.law(xi, inputs[2], inputs[3], jnp.clip(env, low, high))
+
+    states, inputs, envs = runs
+    alone = jax.jit(jax.vmap(jax.vmap(control)))(states[:, :-1, BODY], inputs, envs)
+    expected = np.clip(alone + inputs[..., :2], plant.control_low, plant.control_high)
+    off = np.abs(controls - expected) > FITS * np.asarray(trained.law.perturbation)
+    off = np.any(off, axis=-1)
+    worst = int(np.argmax(off.mean(axis=1)))
+    if (share := off[worst].mean()) > UNFIT:
+        raise ValueError(
+            f"{sources[worst]}: in {share:.0%} of the steps the control is not that of "
+            "the law of this policy plus nu: another law has driven"
+        )
+    nu = jnp.where(off[..., None], controls - alone, inputs[..., :2])
+    return runs._replace(controls=inputs.at[..., :2].set(nu))
 
 
 def _check(log: Log, columns: Columns, dt: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -349,17 +348,3 @@ def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory
 
 _SWITCHING: dict[tuple[Path, int], Trajectory] = {}
 """Runs under S3 by data set and number, which rows of a comparison share."""
-
-
-def check_calibration_size(dataset: Dataset, level: float) -> None:
-    """Check before training that the calibration part supports the level."""
-    count = dataset.calibration.controls.shape[0]
-    # As `conformal_quantile` will ask, but before the training.
-    if math.ceil((count + 1) * level) > count:
-        # Rounded down, so that the proposed level is accepted.
-        highest = math.floor(100 * count / (count + 1)) / 100
-        raise ValueError(
-            f"{count} calibration segments are too few for "
-            f"certification.level={level:g}: "
-            f"record more, or pass certification.level={highest:g}"
-        )

@@ -57,7 +57,7 @@ def read(
     options: Any = arguments(logs, from_logs)
     options |= {"dt": plant.dt, "wheelbase": plant.wheelbase}
     return from_logs(
-        logs.path,
+        str(logs.path),
         columns,
         report=store.print_message,
         needs_environment=environment.is_known,
@@ -82,21 +82,28 @@ def with_identified(settings: Settings) -> Settings:
     about = store.plain({"vehicle": vehicle, "environment": environment.box})
     del about["vehicle"]["path"]
     about["environment_known"] = environment.is_known
+    names = vehicle.columns.environment if environment.is_known else ()
     folder = f"logged-{store.sha256(about)[:8]}"
     path = Path(settings.root) / "vehicles" / folder / "vehicle.safetensors"
     with store.locked(path.parent, wait=True):  # other runs share the vehicle
         if not path.is_file():
-            logged = read(vehicle, environment, vehicle)
-            arrays = _identify(logged, vehicle.dt) | _box(
-                logged, vehicle, environment.is_known
-            )
+            logged = read(vehicle, environment, vehicle).dataset
+            low, high = map(np.asarray, (logged.env_low, logged.env_high))
+            if not names:  # nothing depends on what nobody measured
+                low, high = -np.ones_like(low), np.ones_like(high)
+            if (still := low == high).any():
+                raise ValueError(
+                    f"{names[int(still.argmax())]} is always the same in the logs: "
+                    "leave it out of vehicle.columns.environment"
+                )
+            box = {"env_low": low, "env_high": high}
+            arrays = box | _identify(logged, vehicle.dt)
             store.write_arrays(path, arrays, kind=build.IDENTIFIED, config=about)
     arrays, _ = store.read_arrays(path, kind=build.IDENTIFIED, config=about)
     reached = {name: np.asarray(value).tolist() for name, value in arrays.items()}
     limits = {name: getattr(vehicle, name) or reached[name] for name in LIMITS}
-    names = vehicle.columns.environment if environment.is_known else ()
     scenario: Any = settings.scenario
-    low, high = reached["speed"]
+    slowest, fastest = reached["speed"]
     return replace(
         settings,
         vehicle=replace(vehicle, identified=str(path), **limits),
@@ -106,26 +113,9 @@ def with_identified(settings: Settings) -> Settings:
             high=reached["env_high"],
             names=environment.names or names,
         ),
-        scenario=replace(scenario, speed=min(max(scenario.speed, low), high)),
+        scenario=replace(scenario, speed=min(max(scenario.speed, slowest), fastest)),
         dataset=_within(settings.dataset, reached),
     )
-
-
-def _box(
-    logged: LoggedDataset, vehicle: LoggedVehicleSettings, known: bool
-) -> dict[str, Any]:
-    """The box of e in which runs are generated."""
-    low, high = logged.dataset.env_low, logged.dataset.env_high
-    # Nothing depends on what nobody measured.
-    if not known:
-        low, high = -jnp.ones_like(low), jnp.ones_like(high)
-    for name, least, most in zip(vehicle.columns.environment, low, high, strict=False):
-        if not least < most:
-            raise ValueError(
-                f"{name} is always {least:g} in the logs: leave it out of "
-                "vehicle.columns.environment"
-            )
-    return {"env_low": low, "env_high": high}
 
 
 def _within(drives: Any, reached: dict[str, Any]) -> Any:
@@ -148,9 +138,9 @@ def _within(drives: Any, reached: dict[str, Any]) -> Any:
     return replace(drives, **changes)
 
 
-def _identify(logged: LoggedDataset, dt: float) -> dict[str, Any]:
+def _identify(dataset: Dataset, dt: float) -> dict[str, Any]:
     """Fit a model of one step to logs; return its arrays, and what the logs reach."""
-    began, dataset = time.perf_counter(), logged.dataset
+    began = time.perf_counter()
     model, start, fitted = regression(dataset, *jax.random.split(jax.random.key(0)))
     found = {"least squares": _linear(start), "regression": fitted}
     horizon = min(HORIZON, dataset.validation.controls.shape[1])
@@ -170,14 +160,9 @@ def _identify(logged: LoggedDataset, dt: float) -> dict[str, Any]:
     parts = [getattr(dataset, part) for part in PARTS]
     states, controls, _ = map(np.concatenate, zip(*parts, strict=True))
     ends = controls.min(axis=(0, 1)), controls.max(axis=(0, 1))
-    reached = dict(zip(LIMITS, ends, strict=True)) | _drives(states, dt)
-    slowest, fastest = reached["speed"]
-    store.print_message(
-        f"the logs reach {slowest:.3g} to {fastest:.3g} m/s and lateral accelerations "
-        f"to {reached['lateral_acceleration']:.2g} m/s^2; drives stay inside"
-    )
-    space = measure_space(dataset)._asdict()
-    return reached | models.flat({"space": space, "params": found[best]})
+    fitted = {"space": measure_space(dataset)._asdict(), "params": found[best]}
+    limits = dict(zip(LIMITS, ends, strict=True))
+    return limits | _drives(states, dt) | models.flat(fitted)
 
 
 def _drives(states: np.ndarray, dt: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfkd_jax import build, policy, store
 from sfkd_jax.certification import CertificationRefused, contraction_metrics, issue
-from sfkd_jax.certification.corridor import certify_corridor, closed_loop
+from sfkd_jax.certification.corridor import certify_corridor, check_count, closed_loop
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import (
     SCENARIOS,
@@ -113,7 +113,11 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
         # Whether logs are too few for the level is known before the training.
         if settings.logs:
             dataset, _ = data.ensure_dataset(settings)
-            data.check_calibration_size(dataset, settings.certification.level)
+            count, level = (
+                len(dataset.calibration.controls),
+                settings.certification.level,
+            )
+            check_count(count, level, "calibration segments")
         with store.locked(settings.run_dir):
             runs.claim(settings)
             # Once more under the lock, where nobody else can be writing.

@@ -94,11 +94,9 @@ def simulator(make: Make) -> Vehicle:
 
     or an environment of gymnasium with `state_names` and `dt`, which is reset with
     `options={"state": …, "environment": …}` before every step, and whose observation
-    begins with the state. Where it has them, `control_low`, `control_high`,
-    `wheelbase`, `speed_loop` and `wind_force` are the settings of `own`, `workers` is
-    the number of its copies, each in a process of its own (by default one a core), and
-    `timeout_s` the longest time for its share of a batch, and `environment_names` what
-    the entries of e are, with units.
+    begins with the state. Optional are settings of `own`, `workers` (copies, each in a
+    process of its own; by default one a core), `timeout_s` for a share of a batch, and
+    `environment_names` of the entries of e, with units.
 
     The step works under `jit`, `vmap` and `scan`, a batch at a time, without a
     gradient. If the simulator fails, the state is NaN, and a warning says why.

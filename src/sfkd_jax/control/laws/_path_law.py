@@ -34,14 +34,6 @@ PathStep: TypeAlias = Callable[[Array, Control, Scalar, Array], Array]
 """(ξ, u, κ, e) -> ξ one step later."""
 
 
-class Linearised(NamedTuple):
-    """A step around (ξ, u), its matrices (A, B), and whether ξ stays what it is."""
-
-    both: Float[Array, "*turn both"]
-    slopes: Float[Array, "*turn coordinate both"]
-    steady: Bool[Array, "*turn"]
-
-
 class PathLaw(NamedTuple):
     """Feedback around steady turns, tabulated over a = v² κ, v and e.
 
@@ -237,9 +229,9 @@ def _row(
     def next_turn(known: Array, kappa: Scalar) -> tuple[Array, Array]:
         # Both are given by the point of the table, hence set anew for each turn.
         start = known.at[LATERAL].set(0.0).at[PATH_SPEED].set(condition[0])
-        found = steady_turn(moved(kappa), start)
+        both, steady = steady_turn(moved(kappa), start)
         # Too fast for the friction: the turn of the next smaller curvature stays.
-        turn = jnp.where(found.steady, found.both, known)
+        turn = jnp.where(steady, both, known)
         return turn, turn
 
     def outward(side: Scalar) -> Array:
@@ -278,10 +270,9 @@ def by_differences(
 
 
 def steady_turn(
-    moved: Callable[[Array], Array],
-    start: Float[Array, " both"],
-) -> Linearised:
-    """Solve ξ* = F(ξ*, u*) by Newton's method, and linearise F there.
+    moved: Callable[[Array], Array], start: Float[Array, " both"]
+) -> tuple[Float[Array, " both"], Bool[Array, ""]]:
+    """Solve ξ* = F(ξ*, u*) by Newton's method; return (ξ*, u*), and if it was found.
 
     The unknowns are the relative yaw, the body state without v, and u; e_y and v stay
     as in `start`.
@@ -290,23 +281,21 @@ def steady_turn(
     # e_y and v are given: the car is on its path, at the reference speed.
     free = jnp.asarray([1, *range(3, size + 2)])
 
-    def newton(_: Any, carry: tuple[Array, Linearised]) -> tuple[Array, Linearised]:
-        unknown, _ = carry
-        both = start.at[free].set(unknown)
+    def newton(_: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        both = start.at[free].set(carry[0])
         after, slopes = by_differences(moved, both)
         gap = after - both[:size]
         # Square: two unknown controls take the places of the two fixed coordinates.
         matrix = (slopes - jnp.eye(size, size + 2))[:, free]
-        better = unknown - solve(matrix, gap[:, None])[:, 0]
+        better = carry[0] - solve(matrix, gap[:, None])[:, 0]
         # A NaN compares as False, so that a diverged turn is never steady.
         steady = jnp.max(jnp.abs(gap)) < RESIDUAL_TOLERANCE
-        steady &= jnp.all(jnp.isfinite(both))
-        return better, Linearised(both, slopes, steady)
+        return better, both, steady & jnp.all(jnp.isfinite(both))
 
-    nothing = Linearised(start, jnp.zeros((size, size + 2)), jnp.asarray(False))
+    nothing = start[free], start, jnp.asarray(False)
     # The loop holds the only copy of the step and its derivative, which take long to
     # compile; its last pass evaluates them where the others have led.
-    return jax.lax.fori_loop(0, NEWTON + 1, newton, (start[free], nothing))[1]
+    return jax.lax.fori_loop(0, NEWTON + 1, newton, nothing)[1:]
 
 
 def riccati_gain(
