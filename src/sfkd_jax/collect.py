@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax import policy, store
+from sfkd_jax import build, policy, store
 from sfkd_jax.certification.corridor import (
     calibrate_on_runs,
     check_count,
@@ -26,7 +26,7 @@ def run(settings: Settings) -> dict[str, Any]:
     """Write a certificate with the corridor of recorded runs beside that of the run."""
     folder, level = settings.run_dir, settings.certification.level
     trained = policy.restore(folder)
-    document, reason = policy.read_certificate(folder, trained, (policy.CERTIFICATE,))
+    document, reason = policy.read_certificate(folder, trained)
     if document is None or trained.law is None or "corridor" not in document:
         raise ValueError(
             f"{folder}: nothing to calibrate again, "
@@ -38,10 +38,11 @@ def run(settings: Settings) -> dict[str, Any]:
     check_count(count, level, "runs")
     parts = trained.vehicle, trained.model, trained.params, trained.law
     scores, lateral = scores_of_runs(closed_loop(*parts, ()), document, runs)
-    inside = corridor_coverage(document["corridor"]["bounds"], scores)["coverage"]
+    known = corridor_coverage(build.corridor_of(document)["bounds"], scores)
     store.print_message(
-        f"{count} runs, cut to the shortest, {seconds:g} s; "
-        f"{inside:.0%} of them inside the bounds of the certificate"
+        f"{count} runs, cut to the shortest, {seconds:g} s: "
+        f"{1e3 * np.sqrt(np.mean(lateral**2)):.1f} mm (RMS) from the path, "
+        f"{known['coverage']:.0%} of them inside the corridor that was known before"
     )
     for some in (number for number in COUNTS if number <= count):
         at = some / (some + 1) - 1e-9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial, wraps
@@ -25,8 +25,7 @@ from sfkd_jax.types import Controller, Key, Model, Params
 
 KIND, LAW = "policy", "law"
 CERTIFICATE, RECORDED = "certificate.json", "certificate.runs.json"
-CERTIFICATES = (RECORDED, CERTIFICATE)
-"""That with the corridor of recorded runs comes first."""
+"""Of a run; and with the corridor of recorded runs, which comes first."""
 UNITS = {"p_x": "[m]", "p_y": "[m]", "v": "[m/s]", "v_y": "[m/s]"}
 FRICTION_AND_WIND = ["friction [-]", "lateral wind [m/s]"]
 UNITS |= {"yaw": "[rad]", "yaw_rate": "[rad/s]", "steering": "[rad]"}
@@ -426,7 +425,7 @@ def read_certificate(
     trained: TrainedModel,
     names: Sequence[str] = (RECORDED, CERTIFICATE),
 ) -> tuple[dict[str, Any] | None, str]:
-    """Verify the certificate beside a policy, the first of these files that exists.
+    """Verify the certificate beside a policy, in its run directory.
 
     Returns:
         The certificate and "", or None and the reason why there is none.
@@ -436,7 +435,7 @@ def read_certificate(
     """
     from sfkd_jax import certification  # loaded only if there is something to verify
 
-    files = [_file(path).with_name(name) for name in names]
+    files = [_file(path).with_name(name) for name in (RECORDED, CERTIFICATE)]
     file = next((file for file in files if file.exists()), None)
     if file is None:
         return None, f"{CERTIFICATE} is missing"

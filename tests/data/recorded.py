@@ -3,9 +3,11 @@
 import jax
 import numpy as np
 
+from sfkd_jax import control
+from sfkd_jax.data import recorder
 from sfkd_jax.scenarios import project, reference_window, smooth_path
 
-PROJECT = jax.jit(project)
+ERRORS, PROJECT = jax.jit(control.path_errors), jax.jit(project)
 WINDOW = jax.jit(reference_window, static_argnames=("dt", "horizon"))
 STATE = ("p_x", "p_y", "yaw", "v")
 NAMES = ("t", *STATE, "steering", "acceleration", "friction", "wind")
@@ -63,15 +65,13 @@ def hand_driven(car, seed):
 
     def act(observation, env, reference):
         noise[:] = 0.85 * noise + random.normal(0.0, [0.012, 0.4])
-        (x, y, yaw, _), (_, _, after, _) = reference[:2]
-        dx, dy = observation[0] - x, observation[1] - y
-        aside = np.cos(yaw) * dy - np.sin(yaw) * dx
-        turned = np.angle(np.exp(1j * (observation[2] - yaw)))
+        yaw, after = reference[:2, 2]
+        aside, turned, _ = ERRORS(observation, reference[0], 0.0)
         bend = (after - yaw) / (reference[0, 3] * car.dt)
         steer = car.wheelbase * bend - 0.04 * aside - 0.5 * turned
         push = 0.6 * (reference[0, 3] - observation[3])
-        control = np.array([steer, push]) + noise
-        return np.clip(control, car.control_low, car.control_high)
+        wanted = np.array([steer, push]) + noise
+        return np.clip(wanted, car.control_low, car.control_high)
 
     return act
 
@@ -88,8 +88,34 @@ def drive(car, act, box, *, seconds, seed, speed=(8.0, 11.0), bend=0.02):
         wave = 0.5 + 0.5 * np.sin(0.25 * k * car.dt + phase)
         wanted = speed[0] + (speed[1] - speed[0]) * wave
         reference = np.asarray(WINDOW(path, along, wanted, dt=car.dt, horizon=20))
-        control = np.asarray(act(state.astype(np.float32), env, reference), float)
-        yield [k * car.dt, *state, *control, *env]
+        u = np.asarray(act(state.astype(np.float32), env, reference), float)
+        yield [k * car.dt, *state, *u, *env]
         car.reset(state)
-        state = np.asarray(car.step(control, env), float)
+        state = np.asarray(car.step(u, env), float)
         along, _ = PROJECT(path, state[:2], along + state[3] * car.dt)
+
+
+def drive_by_hand(car, folder, box, seeds, seconds, names):
+    """Logs of a car under its own driver, a csv file a run."""
+    folder.mkdir(parents=True)
+    for seed in seeds:
+        runs = drive(car, hand_driven(car, seed), box, seconds=seconds, seed=seed)
+        columns = dict(zip(names, np.transpose([*runs]), strict=True))
+        write_csv(folder / f"{seed}.csv", columns)
+
+
+def drive_under(policy, car, folder, box, seeds, seconds):
+    """Runs of a car under a policy, as its user records them."""
+    decide = jax.jit(policy.controller.act)
+    for seed in seeds:
+        state = policy.controller.init(jax.random.key(seed))
+        with recorder(policy, folder / f"{seed}.csv") as record:
+
+            def act(observation, env, reference):
+                nonlocal state
+                seen = observation, np.float32(env), reference
+                u, state, info = decide(policy.params, state, *seen)
+                record(*seen[:2], u, info)
+                return u
+
+            [*drive(car, act, box, seconds=seconds, seed=seed, bend=0.015)]

@@ -115,7 +115,7 @@ def _under_law(
     plant, box = trained.vehicle, trained.settings["environment"]
     low, high = jnp.asarray(box["low"]), jnp.asarray(box["high"])
 
-    def control(xi: PathState, inputs: Control, env: Environment) -> Control:
+    def control(xi: PathState, inputs: Control, env: Environment) -> jax.Array:
         return trained.law(xi, inputs[2], inputs[3], jnp.clip(env, low, high))
 
     states, inputs, envs = runs

@@ -34,7 +34,9 @@ REGRESSION = 16_000
 STEEPEST = ("peak_curvature", "lateral_acceleration", "acceleration")
 """Settings of drives that end where the logs of a vehicle do."""
 LIMITS = ("control_low", "control_high")
-"""Of the actuators: the range of the logs unless they are given."""
+"""Of the actuators: the range of the logs and some headroom unless they are given."""
+HEADROOM = 1.5
+"""Width of the limits over that of the range."""
 HORIZON = 20
 """Steps ahead at which models are compared."""
 
@@ -159,9 +161,11 @@ def _identify(dataset: Dataset, dt: float) -> dict[str, Any]:
     )
     parts = [getattr(dataset, part) for part in PARTS]
     states, controls, _ = map(np.concatenate, zip(*parts, strict=True))
-    ends = controls.min(axis=(0, 1)), controls.max(axis=(0, 1))
+    # A law steers more than a driver: at the ends of the logs it would stop short.
+    low, high = controls.min(axis=(0, 1)), controls.max(axis=(0, 1))
+    more = 0.5 * (HEADROOM - 1.0) * (high - low)
     fitted = {"space": measure_space(dataset)._asdict(), "params": found[best]}
-    limits = dict(zip(LIMITS, ends, strict=True))
+    limits = dict(zip(LIMITS, (low - more, high + more), strict=True))
     return limits | _drives(states, dt) | models.flat(fitted)
 
 
