@@ -1,6 +1,7 @@
 """Recorded runs through the commands: from csv files to a policy that loads."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -146,6 +147,9 @@ def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tm
     assert identity(tmp_path / "moved") != here
 
 
+BOX = ([0.4, -5], [0.9, 5])
+
+
 class Car:
     """A car that nobody knows: the kinematic plant, of another mass."""
 
@@ -166,7 +170,7 @@ class Car:
 def driven(tmp_path_factory):
     """Six runs of that car under its own driver; a number is missing in one row."""
     folder = tmp_path_factory.mktemp("car") / "logs"
-    drive_by_hand(Car(), folder, ([0.4, -5], [0.9, 5]), range(6), 30, NAMES)
+    drive_by_hand(Car(), folder, BOX, range(6), 30, ",".join(NAMES))
     rows = (folder / "0.csv").read_text().splitlines()
     rows[101] = rows[101].rpartition(",")[0] + ",nan"
     (folder / "0.csv").write_text("\n".join(rows) + "\n")
@@ -181,20 +185,15 @@ def logged(folder, *more):
 def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsys):
     monkeypatch.setattr(identified, "REGRESSION", 400)
     chosen = logged(driven, "vehicle.missing=drop")
-    said = capsys.readouterr().err
-    assert "wind is nan, 0.33 % of the rows, dropped" in said
-    assert "it is the regression" in said
+    assert "wind is nan, 0.33 % of the rows, dropped" in capsys.readouterr().err
     plant = build.build_vehicle(chosen.vehicle)
-    for limits in chosen.environment.box.values():
-        assert 0.4 <= limits[0] <= 0.9
-        assert -5 <= limits[1] <= 5
+    (low, calm), (high, windy) = chosen.environment.box.values()
+    assert 0.4 <= low < high <= 0.9
+    assert -5.0 <= calm < windy <= 5.0
     assert 5.0 < chosen.dataset.speed[0] < chosen.dataset.speed[1] <= 12.0
-    assert chosen.dataset.law.speed == chosen.dataset.speed
     assert -0.5 < plant.control_low[0] < -0.02 < 0.02 < plant.control_high[0] < 0.5
     state, control, env = np.float32([5, 2, 1, 9]), np.float32([0.03, 0.5]), (0.5, 3.0)
-    car = Car()
-    car.reset(state)
-    expected = car.step(control, env)
+    expected = Car.advance(state, control, np.float32(env))
     after = jax.jit(plant.step)(state, control, np.float32(env))
     np.testing.assert_allclose(after, expected, atol=5e-3)
     # What the run is made from are the contents of the logs, wherever they lie.
@@ -203,8 +202,6 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
     again = logged(moved, "vehicle.missing=drop")
     assert "fitted" not in capsys.readouterr().err
     assert data.config(again) == data.config(chosen)
-    (moved / "1.csv").unlink()
-    assert data.fingerprint(str(moved)) != chosen.vehicle.contents
 
 
 @pytest.mark.parametrize(
@@ -212,10 +209,7 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
     [
         ((), "wind is nan"),
         (("vehicle.path=null",), "vehicle=logged needs vehicle.path=FOLDER"),
-        (
-            ("vehicle.missing=drop", "dataset.speed=[20,30]"),
-            "dataset.speed is 20 to 30 m/s, the logs of the vehicle reach 6",
-        ),
+        (("vehicle.missing=drop", "dataset.speed=[20,30]"), "the vehicle reach 6"),
     ],
 )
 def test_logs_that_make_no_vehicle_are_refused_in_one_line(driven, more, says):
@@ -224,17 +218,14 @@ def test_logs_that_make_no_vehicle_are_refused_in_one_line(driven, more, says):
     assert "\n" not in str(refused.value)
 
 
-SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained" / "kinematic_path"
-
-
 @pytest.fixture(scope="module")
 def under_policy(tmp_path_factory):
     """A run directory, and five runs of the car under its policy."""
     root, car = tmp_path_factory.mktemp("collect"), Car()
     folder = root / "car" / "sfkd_path" / "seed=0"
-    shutil.copytree(SHIPPED, folder)
-    policy, box = sfkd_jax.load(folder), ([0.4, -5], [0.9, 5])
-    drive_under(policy, car, root / "recorded", box, range(5), seconds=6)
+    pretrained = Path(sfkd_jax.__file__).parent / "pretrained"
+    shutil.copytree(pretrained / "kinematic_path", folder)
+    drive_under(sfkd_jax.load(folder), car, root / "recorded", BOX, range(5), 6)
     return root
 
 
@@ -245,37 +236,26 @@ def collected(root, runs="recorded", level=0.8):
 
 def test_runs_of_the_car_calibrate_its_corridor_again(under_policy, capsys):
     made = collected(under_policy)
-    assert "after 5 runs: corridor" in (said := capsys.readouterr().err)
-    assert "at level 0.83" in said
+    says = r"after 5 runs: corridor [\d.]+ m at level 0.83"
+    assert re.search(says, capsys.readouterr().err)
     folder = Path(made["certificate"]).parent
     policy = sfkd_jax.load(folder)
-    before = json.loads((folder / "certificate.json").read_text())["corridor"]
     claim = policy.certificate["recorded"]
-    assert claim["conditions"]["runs"] == 5
-    assert claim["corridor_m"] == made["corridor_m"]
-    assert claim["bounds"]["nominal"] >= before["bounds"]["nominal"]
+    before = policy.certificate["corridor"]["bounds"]["nominal"]
+    assert claim["bounds"]["nominal"] >= before
     assert made["conditions"]["lateral_m"] <= made["corridor_m"]
     assert "of 5 runs of the car" in repr(policy)
     collected(under_policy)
     assert "is replaced" in capsys.readouterr().err
     forged = policy.certificate | {"recorded": claim | {"corridor_m": 0.01}}
     Path(made["certificate"]).write_text(json.dumps(forged))
-    with pytest.raises(ArtefactError, match="recorded.corridor_m does not follow"):
+    with pytest.raises(ArtefactError, match=r"recorded\.corridor_m does not follow"):
         sfkd_jax.load(folder)
     Path(made["certificate"]).unlink()
 
 
-def changed(rows, kind):
-    """Rows of a run that is not usable."""
-    names = rows[0].split(",")
-    table = [row.split(",") for row in rows[1:]]
-    if kind == "nan":
-        table[3][names.index("e_y")] = "nan"
-    if kind == "law":
-        for row in table:
-            row[names.index("steering")] = "0.1"
-    kept = [k for k, name in enumerate(names) if (name, kind) != ("wind", "no e")]
-    return [",".join(row[k] for k in kept) for row in [names, *table]]
+CHANGES = {"no e": ("wind", "gust"), "law": ("nu_1,nu_2", "nu_2,nu_1")}
+CHANGES |= {"nan": ("\n0.3,", "\nnan,")}
 
 
 @pytest.mark.parametrize(
@@ -284,8 +264,8 @@ def changed(rows, kind):
         ("none", "no .csv, .npz, .parquet in this folder"),
         ("few", "5 runs are too few for certification.level=0.9: .*level=0.83"),
         ("no e", "no column wind among"),
-        ("law", "in 100% of the steps the control is not that of the law"),
-        ("nan", "e_y is nan"),
+        ("law", "of the steps the control is not that of the law"),
+        ("nan", "line 5: t is nan"),
         ("twice", "two runs are the same"),
     ],
 )
@@ -293,8 +273,8 @@ def test_runs_that_calibrate_nothing_are_refused_in_one_line(under_policy, kind,
     folder = under_policy / kind
     folder.mkdir()
     for file in [*(under_policy / "recorded").iterdir()] * (kind != "none"):
-        rows = changed(file.read_text().splitlines(), kind)
-        (folder / file.name).write_text("\n".join(rows) + "\n")
+        text = file.read_text().replace(*CHANGES.get(kind, ("", "")))
+        (folder / file.name).write_text(text)
     if kind == "twice":
         shutil.copy(folder / "0.csv", folder / "5.csv")
     with pytest.raises(ValueError, match=says) as refused:

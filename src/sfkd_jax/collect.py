@@ -28,10 +28,8 @@ def run(settings: Settings) -> dict[str, Any]:
     trained = policy.restore(folder)
     document, reason = policy.read_certificate(folder, trained)
     if document is None or trained.law is None or "corridor" not in document:
-        raise ValueError(
-            f"{folder}: nothing to calibrate again, "
-            f"{reason or 'its certificate has no corridor'}"
-        )
+        reason = reason or "its certificate has no corridor"
+        raise ValueError(f"{folder}: nothing to calibrate again, {reason}")
     runs, contents = recorded_runs(settings.collect.path, trained)
     count, steps = runs.controls.shape[:2]
     seconds = steps * trained.vehicle.dt

@@ -76,7 +76,7 @@ def hand_driven(car, seed):
     return act
 
 
-def drive(car, act, box, *, seconds, seed, speed=(8.0, 11.0), bend=0.02):
+def drive(car, act, box, seconds, seed, speed=(8.0, 11.0), bend=0.02):
     """One run on a random road while e switches in its box: rows as a log has them."""
     random, key = np.random.default_rng(seed), jax.random.key(seed)
     path = smooth_path(key, length=speed[1] * seconds + 60.0, peak_curvature=bend)
@@ -99,9 +99,9 @@ def drive_by_hand(car, folder, box, seeds, seconds, names):
     """Logs of a car under its own driver, a csv file a run."""
     folder.mkdir(parents=True)
     for seed in seeds:
-        runs = drive(car, hand_driven(car, seed), box, seconds=seconds, seed=seed)
-        columns = dict(zip(names, np.transpose([*runs]), strict=True))
-        write_csv(folder / f"{seed}.csv", columns)
+        rows = [*drive(car, hand_driven(car, seed), box, seconds, seed)]
+        file, form = folder / f"{seed}.csv", {"delimiter": ",", "comments": ""}
+        np.savetxt(file, rows, "%.12g", header=names, **form)
 
 
 def drive_under(policy, car, folder, box, seeds, seconds):
@@ -118,4 +118,4 @@ def drive_under(policy, car, folder, box, seeds, seconds):
                 record(*seen[:2], u, info)
                 return u
 
-            [*drive(car, act, box, seconds=seconds, seed=seed, bend=0.015)]
+            [*drive(car, act, box, seconds, seed, bend=0.015)]

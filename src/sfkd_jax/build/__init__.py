@@ -81,12 +81,10 @@ class OwnVehicleSettings(VehicleSettings):
     env: str | None = None
 
 
+_KNOWN = ("dt", "wheelbase", "limits", "needs_environment", "report")
 takes_logs = takes(
     from_logs,
-    skip=(
-        *("dt", "wheelbase", "limits", "needs_environment", "report"),
-        *("env_low", "env_high"),
-    ),
+    skip=(*_KNOWN, "env_low", "env_high"),
     columns=schema("Columns", object, Columns),
 )
 """Makes a class a dataclass with the arguments of `data.from_logs`."""

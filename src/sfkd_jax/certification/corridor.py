@@ -206,10 +206,8 @@ def scores_of_runs(
 
     The state of a vehicle is what its sensors show, also to the nominal model.
     """
-    claims = {
-        name: OutputMetric.from_document(part)
-        for name, part in document["outputs"].items()
-    }
+    outputs = document["outputs"]
+    claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
     simulate = jax.jit(partial(simulate_nominal, loop))
     lateral, _, scores = _measure(loop, claims, simulate, runs, jax.random.key(0))
     return scores, lateral

@@ -24,9 +24,7 @@ INPUTS = ("nu_1", "nu_2", "curvature", "v_ref")
 LATE = 0.2
 """Part of a period by which a row may be early or late."""
 FITS, UNFIT = 0.01, 0.01
-"""A control is that of a law if they differ by less than this share of the largest ν;
-on so large a share of the steps it may be another.
-"""
+"""Largest difference from a law in the largest ν, and share of steps beyond it."""
 
 
 def run_columns(trained: Any) -> Columns:

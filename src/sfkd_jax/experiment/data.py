@@ -204,11 +204,9 @@ def derive_law(settings: Settings) -> PathLaw:
     plant = build.build_vehicle(settings.vehicle)
     steps = {"plant": lambda: plant.step, "nominal": lambda: plant.nominal}
     # A model of logs is a learned one already.
-    steps["learned"] = (
-        steps["plant"]
-        if isinstance(settings.vehicle, LoggedVehicleSettings)
-        else partial(_learned_step, settings, plant)
-    )
+    logged = isinstance(settings.vehicle, LoggedVehicleSettings)
+    learned = partial(_learned_step, settings, plant)
+    steps["learned"] = steps["plant"] if logged else learned
     step = steps[along.law.model]()
     store.print_message(
         f"deriving the law of vehicle {plant.name} from its {along.law.model} model"

@@ -33,10 +33,8 @@ REGRESSION = 16_000
 """Optimiser steps of the model that a law is derived from."""
 STEEPEST = ("peak_curvature", "lateral_acceleration", "acceleration")
 """Settings of drives that end where the logs of a vehicle do."""
-LIMITS = ("control_low", "control_high")
-"""Of the actuators: the range of the logs and some headroom unless they are given."""
-HEADROOM = 1.5
-"""Width of the limits over that of the range."""
+LIMITS, HEADROOM = ("control_low", "control_high"), 1.5
+"""Of the actuators: if they are not given, this many times as wide as in the logs."""
 HORIZON = 20
 """Steps ahead at which models are compared."""
 
@@ -98,23 +96,20 @@ def with_identified(settings: Settings) -> Settings:
                     f"{names[int(still.argmax())]} is always the same in the logs: "
                     "leave it out of vehicle.columns.environment"
                 )
-            box = {"env_low": low, "env_high": high}
-            arrays = box | _identify(logged, vehicle.dt)
+            arrays = _identify(logged, vehicle.dt)
+            arrays |= {"env_low": low, "env_high": high}
             store.write_arrays(path, arrays, kind=build.IDENTIFIED, config=about)
     arrays, _ = store.read_arrays(path, kind=build.IDENTIFIED, config=about)
     reached = {name: np.asarray(value).tolist() for name, value in arrays.items()}
     limits = {name: getattr(vehicle, name) or reached[name] for name in LIMITS}
     scenario: Any = settings.scenario
+    box = {"low": reached["env_low"], "high": reached["env_high"]}
+    box |= {"names": environment.names or names}
     slowest, fastest = reached["speed"]
     return replace(
         settings,
         vehicle=replace(vehicle, identified=str(path), **limits),
-        environment=replace(
-            environment,
-            low=reached["env_low"],
-            high=reached["env_high"],
-            names=environment.names or names,
-        ),
+        environment=replace(environment, **box),
         scenario=replace(scenario, speed=min(max(scenario.speed, slowest), fastest)),
         dataset=_within(settings.dataset, reached),
     )
