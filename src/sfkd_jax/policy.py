@@ -421,9 +421,7 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
 
 
 def read_certificate(
-    path: str | Path,
-    trained: TrainedModel,
-    names: Sequence[str] = (RECORDED, CERTIFICATE),
+    path: str | Path, trained: TrainedModel
 ) -> tuple[dict[str, Any] | None, str]:
     """Verify the certificate beside a policy, in its run directory.
 
