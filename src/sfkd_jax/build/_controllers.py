@@ -119,7 +119,7 @@ class SearchSettings(ControllerSettings):
     shield: bool = False
     adaptive: bool = False
     feedback: Any = None
-    model_law: Any = None
+    model_law: Any = None  # of policies saved by earlier versions; nothing reads it
     gate: Any = None
     adaptation: Any = None
     online_tube: Any = None
