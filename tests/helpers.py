@@ -41,6 +41,7 @@ VARIANTS = {
     "no_contraction": {"residual": "free"},
     "soft": {"residual": "free", "soft_penalty": 1.0},
     "path": {"frame": "path"},
+    "state": {"frame": "path", "transport": False, "lift": "state", "scheduled": True},
 }
 HARD = ("sfkd", "no_fiber", "no_transport")
 """Variants whose operator and residual are each bounded by construction (and are

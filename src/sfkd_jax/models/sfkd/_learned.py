@@ -22,7 +22,10 @@ ALPHA_START = 2.0
 
 
 class SharedWeights(NamedTuple):
-    """Weights that do not depend on e: vertices, the bounded networks, the read-out."""
+    """Weights that do not depend on e: vertices, the bounded networks, the read-out.
+
+    `lift` is C⁻¹ where z is the state in other coordinates; None where φ lifts.
+    """
 
     vertices: Float[Array, "vertex rank rank"]
     residual: Weights
@@ -30,12 +33,16 @@ class SharedWeights(NamedTuple):
     forcing: tuple[Float[Array, "_ _"], ...]
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
+    lift: Float[Array, "rank body"] | None
 
 
 class PerEnvironment(NamedTuple):
-    """Functions of e: mixture of the vertices, B(e), biases, rotation, embedding."""
+    """Functions of e: mixture of the vertices, B(e), biases, rotation, embedding.
 
-    mixture: Float[Array, " vertex"]
+    A mixture that reads u as well is the one layer of biases before its softmax.
+    """
+
+    mixture: Float[Array, " vertex"] | Biases
     B: Float[Array, "rank control"]
     residual: Biases
     decoder: Biases
@@ -57,6 +64,8 @@ class Learned(nn.Module):
         kind: of the residual, see `RESIDUALS`.
         joint: whether operators and residual are bounded as one map by α = ρ + β;
             otherwise A(e) is bounded by ρ and the residual by β.
+        state_lift: whether z is the state, z = C⁻¹ (s − c); then rank = body.
+        scheduled: whether the mixture of the vertices reads u as well as e.
     """
 
     rank: int
@@ -74,6 +83,8 @@ class Learned(nn.Module):
     joint: bool
     learn_alpha: bool
     forcing_hidden: int
+    state_lift: bool
+    scheduled: bool
 
     def setup(self) -> None:
         """Declare submodules and parameters; stored policies have these names."""
@@ -82,9 +93,11 @@ class Learned(nn.Module):
             [part for layer in layers for part in (layer, nn.tanh)]
         )
         # Small heads: e has little influence until the data ask for it.
-        self.mixture_head = nn.Dense(self.vertices, kernel_init=SMALL)
+        logits = self.vertices * (1 + self.control * self.scheduled)
+        self.mixture_head = nn.Dense(logits, kernel_init=SMALL)
         self.input_head = nn.Dense(self.rank * self.control)
-        self.tangent_head = nn.Dense(self.rank // 2, kernel_init=SMALL)
+        # A car whose state is its speed alone has no plane, but no layer is empty.
+        self.tangent_head = nn.Dense(max(self.rank // 2, 1), kernel_init=SMALL)
         # Weights of networks do not depend on e, only biases do: one bound for all e.
         if self.kind is not None:
             sizes = self.rank, self.residual_hidden, self.rank
@@ -152,6 +165,8 @@ class Learned(nn.Module):
             vertices, residual = separate_budget(self.operators, self.rho), Weights()
             if self.kind is not None:
                 residual = self.residual_weights(self.beta)
+        # Norm at most 1 in scaled units: a ball in z bounds the body state.
+        readout = bounded(self.readout, 1.0)
         decoder = Weights()
         if self.pose:
             # The decoder feeds nothing back, so that its bound may be learned.
@@ -161,9 +176,9 @@ class Learned(nn.Module):
             residual,
             decoder,
             forcing=(self.forcing_weights,) if self.forcing_hidden else (),
-            # Norm at most 1 in scaled units: a ball in z bounds the body state.
-            readout=bounded(self.readout, 1.0),
+            readout=readout,
             centre=self.centre,
+            lift=jnp.linalg.inv(readout) if self.state_lift else None,
         )
 
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
@@ -178,11 +193,14 @@ class Learned(nn.Module):
             decoder = self._biases(self.decoder_head(embedding), widths)
         if self.forcing_hidden:
             forcing = self._biases(self.forcing_head(embedding), (self.forcing_hidden,))
+        mixture = self.mixture_head(embedding)
         # Evaluated in any case, so that the ablation has the same parameters.
         tangents = self.tangent_head(embedding)
         return PerEnvironment(
             # On the simplex by construction: a mixture of contractions contracts.
-            mixture=nn.softmax(self.mixture_head(embedding)),
+            mixture=self._biases(mixture, (self.vertices,))
+            if self.scheduled
+            else nn.softmax(mixture),
             B=self.input_head(embedding).reshape(self.rank, self.control),
             residual=residual,
             decoder=decoder,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich, apply
+from sfkd_jax.models._networks import FRAMES, Biases, Encoder, Sandwich, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
@@ -37,6 +37,8 @@ from sfkd_jax.types import (
     State,
     Structure,
 )
+
+LIFTS = ("network", "state")
 
 
 class PosedLatent(NamedTuple):
@@ -66,16 +68,29 @@ class Mixture(NamedTuple):
         return jnp.tensordot(self.weights, self.vertices, axes=1)
 
 
+class Scheduled(NamedTuple):
+    """A(e, u) = Σ_j w_j A_j with weights w = softmax(G(e) u + h(e))."""
+
+    logits: Biases
+    vertices: Float[Array, "vertex rank rank"]
+
+    def at(self, control: Float[Array, " control"]) -> Mixture:
+        """Return the operator for one scaled control."""
+        # On the simplex whatever u is, and no function of z: it contracts as before.
+        return Mixture(jax.nn.softmax(self.logits.at(control)[0]), self.vertices)
+
+
 class SfkdFiber(NamedTuple):
     """All that depends on e; a network without matrices is absent."""
 
-    A: Mixture | Float[Array, "rank rank"]
+    A: Scheduled | Mixture | Float[Array, "rank rank"]
     local: PerEnvironment
     residual: tuple[Float[Array, "_ _"], ...]
     decoder: tuple[Float[Array, "_ _"], ...]
     forcing: tuple[Float[Array, "_ _"], ...]
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
+    # Weights of φ, or C⁻¹ where z is the state.
     encoder: Any
 
 
@@ -83,12 +98,13 @@ class SfkdFiber(NamedTuple):
 class LatentModel:
     """The functions of `Model`.
 
-    `learned` is all that is learned but the encoder; the last two are of `hinge`.
+    `learned` is all that is learned but the encoder, which is None where z is the
+    state; the last two are of `hinge`.
     """
 
     space: Space
     learned: Learned
-    encoder: Encoder
+    encoder: Encoder | None
     environment: bool
     soft_penalty: float = 0.0
     beta: float = 0.0
@@ -100,10 +116,11 @@ class LatentModel:
         env = jnp.zeros(self.space.env_mean.shape[0])
         # The encoder reads ψ(e), which may have another size than e.
         embedding = jnp.zeros(self.learned.embedding)
-        return {
-            "networks": self.learned.init(network_key, env)["params"],
-            "encoder": self.encoder.init(encoder_key, body, embedding)["params"],
-        }
+        params = {"networks": self.learned.init(network_key, env)["params"]}
+        if self.encoder is not None:
+            encoder = self.encoder.init(encoder_key, body, embedding)
+            params["encoder"] = encoder["params"]
+        return params
 
     def _apply(self, params: Params, method: str, *inputs: Array) -> Any:
         """Call a method of the flax module."""
@@ -129,21 +146,28 @@ class LatentModel:
         shared = self.shared(params)
         scaled = self.space.scaled_env(env, self.environment)
         local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
-        operator = Mixture(local.mixture, shared.vertices)
+        if isinstance(local.mixture, Biases):
+            operator = Scheduled(local.mixture, shared.vertices)
+        else:
+            operator = Mixture(local.mixture, shared.vertices)
+            if isinstance(params, Folded):
+                operator = operator.summed()
         return SfkdFiber(
-            A=operator.summed() if isinstance(params, Folded) else operator,
+            A=operator,
             local=local,
             residual=shared.residual.matrices,
             decoder=shared.decoder.matrices,
             forcing=shared.forcing,
             readout=shared.readout,
             centre=shared.centre,
-            encoder=unfold(params)["encoder"],
+            encoder=unfold(params)["encoder"] if self.encoder else shared.lift,
         )
 
     def encode(self, fiber: SfkdFiber, state: State) -> PosedLatent:
         """Return the latent of a state, beside its pose."""
         body = self.space.scaled_body(state)
+        if self.encoder is None:
+            return PosedLatent(state[POSE], fiber.encoder @ (body - fiber.centre))
         z = self.encoder.apply({"params": fiber.encoder}, body, fiber.local.embedding)
         z = cast(jax.Array, z)
         # Rotated after the lift, so that z of two environments differ by an isometry.
@@ -158,7 +182,8 @@ class LatentModel:
         space, local = self.space, fiber.local
         # Every function of u and e is a bias, which no Lipschitz bound in z sees.
         u = space.scaled_control(control)
-        z = fiber.A @ latent.z + local.B @ u
+        operator = fiber.A.at(u) if isinstance(fiber.A, Scheduled) else fiber.A
+        z = operator @ latent.z + local.B @ u
         if fiber.forcing:
             z = z + fiber.forcing[0] @ jnp.tanh(local.forcing.at(u)[0])
         # Decided by the shape of the weights, that is, when the program is traced.
@@ -250,6 +275,7 @@ def sfkd(
     decoder_hidden: tuple[int, ...] = (64, 32),
     encoder_hidden: int = 32,
     linear_lift: bool = True,
+    lift: str = "network",
     embedding: int = 16,
     frame: str = "body",
     residual: str = "sandwich",
@@ -259,6 +285,7 @@ def sfkd(
     soft_penalty: float = 0.0,
     learn_alpha: bool = False,
     forcing_hidden: NonNegativeInt = 0,
+    scheduled: bool = False,
 ) -> Model:
     """Stable Fiber-Koopman Residual Dynamics (eq:sfkd).
 
@@ -274,7 +301,8 @@ def sfkd(
     which contains all of those and more.
 
     Args:
-        rank: r, even.
+        rank: r, even where there is transport; with `lift="state"` it is the size of s
+            instead.
         rho: ρ; ρ + β < 1 for a certificate. Of a joint budget only the sum counts.
         beta: β.
         vertices: number of operators A_j.
@@ -282,6 +310,9 @@ def sfkd(
         decoder_hidden: hidden widths of D.
         encoder_hidden: hidden width of φ.
         linear_lift: whether φ contains W_0 s, see `Encoder`.
+        lift: "network" is φ; "state" is z = C⁻¹ (s − c), the state in coordinates in
+            which a step contracts: a rollout is then lifted anew at every step, and
+            the error of a step is that of the state alone.
         embedding: size of ψ(e).
         frame: "body" composes the pose on SE(2) outside z; "path" has path coordinates
             as body (see `geometry`) and no pose.
@@ -295,14 +326,20 @@ def sfkd(
             + β, starting close to the latter.
         forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), added to B(e) u; 0 for
             none. It is no function of z, so every bound still holds.
+        scheduled: let the mixture of the A_j read u as well as e: along a path its
+            reference speed and curvature, on which the loop's dynamics depend most.
     """
     check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
     check_choice("model.budget", budget, BUDGETS)
+    check_choice("model.lift", lift, LIFTS)
     kind = RESIDUALS[residual]
+    state_lift = lift == "state"
+    if state_lift:
+        rank = space.body_mean.shape[0]
     # Planes are pairs of coordinates; of an odd number one would be left over.
-    if rank % 2:
-        raise ValueError(f"model.rank must be even, got {rank}")
+    if transport and rank % 2:
+        raise ValueError(f"model.transport needs an even rank, got {rank}")
     if soft_penalty and kind is None:
         raise ValueError("model.soft_penalty needs a residual, got model.residual=none")
     learned = Learned(
@@ -323,6 +360,8 @@ def sfkd(
         pose=frame != "path",
         learn_alpha=learn_alpha,
         forcing_hidden=forcing_hidden,
+        state_lift=state_lift,
+        scheduled=scheduled,
     )
     # A separate budget has α = ρ + β, with nothing to learn.
     if learn_alpha and (not learned.joint or rho + beta <= LOWEST_RATE):
@@ -330,7 +369,7 @@ def sfkd(
             "model.learn_alpha needs model.residual=sandwich, model.budget=joint and "
             f"model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
         )
-    encoder = Encoder(rank, encoder_hidden, linear_lift)
+    encoder = None if state_lift else Encoder(rank, encoder_hidden, linear_lift)
     return LatentModel(space, learned, encoder, environment, soft_penalty, beta).model()
 
 
