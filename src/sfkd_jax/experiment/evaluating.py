@@ -273,16 +273,25 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     episodes = make_episodes(settings)
     runs.read_results(settings.run_dir)
     compared = load_systems(settings)
-    found = drive(settings, compared, episodes)
-    seconds = time.perf_counter() - began
     config = store.plain(settings) | ({"command": command} if command else {})
-    return runs.write_results(settings.run_dir, config, found, seconds)
+
+    def keep(found: list[SystemResult]) -> Path:
+        seconds = time.perf_counter() - began
+        return runs.write_results(settings.run_dir, config, found, seconds)
+
+    return keep(drive(settings, compared, episodes, keep))
 
 
 def drive(
-    settings: Settings, systems: Mapping[str, System], episodes: EpisodeSet
+    settings: Settings,
+    systems: Mapping[str, System],
+    episodes: EpisodeSet,
+    keep: Callable[[list[SystemResult]], Any] = lambda found: None,
 ) -> list[SystemResult]:
-    """Simulate, score and compare systems on the same episodes, with messages."""
+    """Simulate, score and compare systems on the same episodes, with messages.
+
+    `keep` receives each system as it is done: a command that is stopped loses no other.
+    """
     protocol, found = settings.evaluation, list[SystemResult]()
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     if has_course(settings):
@@ -292,6 +301,7 @@ def drive(
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         result = SystemEvaluation(settings, name, system)(episodes)
         found.append(result)
+        keep([result])
         error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
     evaluation.compare([result.row for result in found])
