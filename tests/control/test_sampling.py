@@ -8,6 +8,7 @@ import pytest
 from sfkd_jax import control
 from sfkd_jax.control.planners._mppi import (
     effective_sample_size,
+    shrunk,
     softmin,
     temperature_for,
 )
@@ -82,3 +83,50 @@ def test_more_than_there_are_gives_all_and_bad_ones_never_count():
 def test_costs_without_a_spread_give_a_finite_temperature(costs):
     temperature = temperature_for(jnp.asarray(costs), jnp.asarray(2.0))
     assert bool(jnp.isfinite(temperature) & (temperature > 0))
+
+
+def test_a_mean_of_noise_stays_at_the_plan_and_one_of_a_signal_moves_to_it():
+    noise = jnp.asarray(drawn("white", samples=64))
+    even = jnp.full(64, 1.0 / 64)
+    plan = jnp.ones((HORIZON, 2))
+
+    def moved(signal):
+        samples = plan[:, None] + noise + signal
+        mean = jnp.einsum("m,tmc->tc", even, samples)
+        return shrunk(mean, plan, even, samples) - plan, mean - plan
+
+    # Half the spread of the mean on average: most of the move is noise.
+    nothing, whole = moved(0.0)
+    assert np.sum(nothing**2) < 0.2 * np.sum(whole**2)
+    far, whole = moved(10.0)
+    np.testing.assert_allclose(far, whole, rtol=2e-3)
+    # One sample, or samples that are all alike, say nothing about their variance.
+    same, whole = shrunk(plan, plan, even, plan[:, None] + 0.0 * noise), plan
+    np.testing.assert_array_equal(same, whole)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 16])
+def test_few_samples_are_not_worse_than_the_law_alone(samples):
+    """Around the optimum of a quadratic cost every move is one of noise."""
+    task = control.free_task(
+        lambda params, x, u, e: x + 0.1 * u,
+        lambda weights, x, u, before, target: jnp.sum(x**2) + jnp.sum(u**2),
+    )
+
+    def energy(shrinkage):
+        planner = control.mppi(
+            task,
+            num_samples=samples,
+            horizon=5,
+            noise_std=(0.3, 0.3),
+            temperature=5.0,
+            shrinkage=shrinkage,
+        )
+        state, used = planner.init(jax.random.key(0)), 0.0
+        act = jax.jit(planner.act)
+        for _ in range(20):
+            u, state, _ = act({}, state, jnp.zeros(2), jnp.zeros(1), ())
+            used += float(jnp.sum(u**2))
+        return used
+
+    assert energy(True) <= 0.3 * energy(False)

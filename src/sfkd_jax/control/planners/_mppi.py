@@ -15,6 +15,7 @@ from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
     PlannerState,
+    Plans,
     SearchResult,
     Tuning,
     iterate,
@@ -46,6 +47,8 @@ class Mppi(SamplingPlanner):
         temperature: λ, in units of cost; initial value in `Tuning`.
         effective_samples: if not 0, λ is chosen at every iteration such that 1 / Σ w²
             has this value; 0 keeps λ at `temperature`. Both are data, see `Tuning`.
+        shrinkage: whether the mean moves away from the plan only as far as its variance
+            lets it, see `shrunk`: few samples then do no harm.
 
     Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO
     34(6).
@@ -53,6 +56,7 @@ class Mppi(SamplingPlanner):
 
     temperature: Positive = 5.0
     effective_samples: float = 0.0
+    shrinkage: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,7 +82,11 @@ class Mppi(SamplingPlanner):
         def improve(plan: Plan, key: Key) -> tuple[Plan, SearchResult]:
             noise = self.draw(key, tuning.noise_std)
             # Sample 0 is the plan itself: what was good stays among the candidates.
-            evaluated = evaluate(plan[:, None] + noise.at[:, 0].set(0.0))
+            plans = plan[:, None] + noise.at[:, 0].set(0.0)
+            if self.shrinkage:
+                # Sample 1 is the law alone; of one sample there is none.
+                plans = plans.at[:, 1].set(0.0, mode="drop")
+            evaluated = evaluate(plans)
             ranks, any_kept = evaluated.ranked()
             temperature = tuning.temperature
             if self.effective_samples:
@@ -93,6 +101,10 @@ class Mppi(SamplingPlanner):
             # Average what the limits allowed, not what was sampled.
             allowed = replace_nonfinite(evaluated.perturbations, 0.0)
             mean = jnp.einsum("m,tmc->tc", weights, allowed)
+            if self.shrinkage:
+                # The noise of earlier steps ends where the law alone is as good.
+                best = jnp.where(ranks[1] <= ranks[0], allowed[:, 1], allowed[:, 0])
+                mean = shrunk(mean, best, weights, allowed)
             return mean, SearchResult(
                 plan=mean,
                 usable=usable,
@@ -122,6 +134,25 @@ def softmin(
     scaled = jnp.where(finite, costs, 0.0) / jnp.where(positive, temperature, 1.0)
     scores = jnp.where(usable, jnp.where(finite, -scaled, -jnp.inf), 0.0)
     return jax.nn.softmax(scores), usable
+
+
+def shrunk(
+    mean: Plan,
+    plan: Plan,
+    weights: Float[Array, " sample"],
+    samples: Plans,
+) -> Plan:
+    """Return a weighted mean, shrunk towards a plan by the James–Stein rule.
+
+        ν + max(0, 1 − Σ_t s_t² / Σ_t |ν̄_t − ν_t|²) (ν̄ − ν),   s² = Σ_m w_m² (ν^m − ν̄)²
+
+    for each control, with the positive part alone; s² estimates the variance of ν̄.
+    """
+    variance = jnp.einsum("m,tmc->c", weights**2, (samples - mean[:, None]) ** 2)
+    moved = mean - plan
+    # Away from 0: without a move there is nothing to shrink.
+    share = 1.0 - variance / (jnp.sum(moved**2, axis=0) + 1e-12)
+    return plan + jnp.maximum(share, 0.0) * moved
 
 
 def effective_sample_size(weights: Float[Array, " sample"]) -> Scalar:
