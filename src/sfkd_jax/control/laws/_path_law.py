@@ -177,7 +177,8 @@ def derive_path_law(
         velocity: weight [s²/m²]; the weights of further coordinates are zero.
         curvature: weight of the steering [m²], on the curvature that it produces on the
             steady turns. Where the tyres give less, the law steers more, and the loop
-            stays as fast.
+            stays as fast. Not on the lateral acceleration: along the path the loop has
+            the same shape at every speed, so that one metric serves all of them.
         drive: weight, per control unit².
     """
     low, high = (
