@@ -38,6 +38,10 @@ def read(name):
     return json.loads((ROOT / name).read_text("utf-8"))
 
 
+LAWS = ("law", "law_plant", "law_nominal")
+"""The law that ships, and those of the true car and of the textbook bicycle."""
+
+
 def corridor():
     """What the certificates of the shipped policies say, and how they drive S3."""
     certificates = [read(PRETRAINED / f"{car}_path/certificate.json") for car in CARS]
@@ -75,6 +79,10 @@ def corridor():
         [
             "the same, nominal bicycle",
             *(f"{error(car, 'nominal'):.0f}" for car in CARS),
+        ],
+        [
+            "the law alone: of the learned model; of the true car; of the bicycle [mm]",
+            *("; ".join(f"{error(car, law):.1f}" for law in LAWS) for car in CARS),
         ],
     ]
     return table(["", *CARS], lines)

@@ -6,6 +6,10 @@ for vehicle in dynamic kinematic; do
   own=(training.loss.tube=[0.06])
   # Its steering saturates on ice: its 0.95 quantile over 150 runs scatters by 0.05 m.
   [ "$vehicle" = dynamic ] || own=(model.vertices=12 certification.corridor.runs=300)
-  python -m sfkd_jax.train +experiment=s3 vehicle="$vehicle" name="corridor_$vehicle" controller=mppi_path_300 dataset.segments=16000 \
-    training.steps=10000 certification.corridor.attack_steps=1000000 evaluation.episodes=16 "${own[@]}" "$@"
+  run=(+experiment=s3 vehicle="$vehicle" name="corridor_$vehicle" dataset.segments=16000 training.steps=10000 "${own[@]}"
+    certification.corridor.attack_steps=1000000 evaluation.episodes=16 "$@")
+  python -m sfkd_jax.certify "${run[@]}"
+  python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300
+  # The law alone: of the learned model, of the textbook bicycle, of the true car.
+  python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300 controller.mppi.num_samples=1 'evaluation.systems=[law,law_nominal,law_plant]'
 done
