@@ -129,6 +129,3 @@ def test_what_adaptation_brings():
     assert round(ratio("dynamic", "stiffness - 30 %"), 2) == 1.25
     assert round(ratio("dynamic", "e not measured"), 1) == 1.2
     assert 2.0 < ratio("kinematic", "e not measured") < 2.2
-    wrong = "friction 0.2, told 0.9, 12 m/s"
-    assert found["dynamic", wrong, "SFKD, adaptive, cautious"]["left_the_lane"] == 0
-    assert found["dynamic", wrong, "SFKD, adaptive"]["left_the_lane"] == 24

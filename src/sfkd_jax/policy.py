@@ -319,8 +319,7 @@ def load(
             coordinates that estimates the environment and ignores the one it is given;
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
-            errors of its inputs while driving, see `control.Adaptation`, and slows down
-            where its plans are too far off for the lane, see `control.OnlineTube`.
+            errors of its inputs while driving, see `control.Adaptation`.
 
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold.

@@ -248,13 +248,6 @@ class ControllerInfo(TypedDict, total=False):
     causes_std: Float[Array, " 5"]  # standard deviations of the estimates
     rejected: Bool[Array, ""]  # nothing was learned from the measurement
     adapting: Bool[Array, ""]  # the causes do not predict worse than none
-    # OnlineTube
-    tube: Float[Array, " horizon"]  # radius around the plan [m]
-    tube_errors: Float[Array, " horizon"]  # of the plans of 1 … horizon steps ago [m]
-    tube_missed: Bool[Array, " horizon"]  # an error exceeds the radius it had
-    online_corridor: Scalar  # largest |e_y| of the plan with its tube [m]
-    speed_factor: Scalar  # of the reference speed at the next step
-    grip: Scalar  # lateral acceleration that was shown [m/s²]; 0: not limited
     # delay_compensated
     arrival_state: Float[Array, " state"]  # at which the control arrives, predicted
     # Shield

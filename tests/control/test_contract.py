@@ -144,14 +144,6 @@ def adaptive():
     return gated(adaptation.controller(), model, law, conditions), params
 
 
-def online_tube():
-    """With a tube calibrated while driving, and a lane that is too narrow for it."""
-    law, (model, params) = any_law(), path_model()
-    inner = along(around_law(model, law))
-    tube = control.OnlineTube(inner=inner, horizon=HORIZON, lane=0.02)
-    return tube.controller(), params
-
-
 def constrained():
     """With a lane as a constraint."""
     task, params = along_path(FEEDBACK)
@@ -183,7 +175,6 @@ WRAPPERS = {
     "delay_compensated": delay_compensated,
     "shielded": shielded,
     "adaptive": adaptive,
-    "online_tube": online_tube,
 }
 BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within

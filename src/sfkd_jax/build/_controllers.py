@@ -119,9 +119,10 @@ class SearchSettings(ControllerSettings):
     shield: bool = False
     adaptive: bool = False
     feedback: Any = None
-    model_law: Any = None  # of policies saved by earlier versions; nothing reads it
     gate: Any = None
     adaptation: Any = None
+    # Of policies that were saved by earlier versions: without effect.
+    model_law: Any = None
     online_tube: Any = None
 
 
@@ -139,7 +140,6 @@ def _controller_schema(planner: str) -> type[ControllerSettings]:
             "feedback": control.path_feedback,
             "gate": control.Gate,
             "adaptation": control.Adaptation,
-            "online_tube": control.OnlineTube,
         }
     parts: dict[str, Any] = {
         part: schema(part.title(), object, factory, skip=(*skip, "horizon"))
@@ -187,11 +187,9 @@ def build_controller(
         env_source: one of `ENV_SOURCES`; "estimated" needs path coordinates.
         law: that a model in path coordinates was learned around.
         adaptive: whether a controller along a path estimates unmeasured forces and
-            errors of its inputs while driving, and slows down while its online tube
-            does not fit the lane, even if the settings do not say so; with "estimated"
-            it always does.
-        planner: along a path, to be shielded in place of that of the settings. Its
-            speed is its own: there is no online tube.
+            errors of its inputs while driving, even if the settings do not say so; with
+            "estimated" it always does.
+        planner: along a path, to be shielded in place of that of the settings.
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, a
@@ -259,12 +257,7 @@ def build_controller(
         along = adaptation.controller()
     conditions = _conditions(certificate, env_low, env_high)
     test = None if estimates else _test(certificate)
-    controller = _gated(along, searches, model, plant, law, conditions, test, estimates)
-    if planner or not adaptive:
-        return controller
-    options = arguments(searches.online_tube, control.OnlineTube)
-    tube = control.OnlineTube(inner=controller, horizon=searches.horizon, **options)
-    return tube.controller()
+    return _gated(along, searches, model, plant, law, conditions, test, estimates)
 
 
 def _gated(

@@ -53,5 +53,4 @@ from sfkd_jax.control.wrappers._innovations import (
 from sfkd_jax.control.wrappers._innovations import innovation_test as innovation_test
 from sfkd_jax.control.wrappers._innovations import steering_level as steering_level
 from sfkd_jax.control.wrappers._innovations import turning_rate as turning_rate
-from sfkd_jax.control.wrappers._online_tube import OnlineTube as OnlineTube
 from sfkd_jax.geometry import reference_curvature as reference_curvature
