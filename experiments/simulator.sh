@@ -1,8 +1,22 @@
 #!/usr/bin/env bash
 # From a simulator that nobody here wrote to a car in its corridor (docs/your-vehicle.md): the dynamic bicycle of highway-env, whose grip and
-# side force switch. Extra arguments are Hydra overrides.
+# side force switch. Beside it, in the same run: MPPI with the textbook bicycle, and a hand-made path-following law alone. Ends with one line of JSON.
+#
+#     bash experiments/simulator.sh [--small] [root=DIR and other Hydra overrides]
 set -euo pipefail
-python -m sfkd_jax.train +experiment=s3 name=highway vehicle=simulator vehicle.env=tests.plants.simulators:highway \
-  'environment.low=[0.35,-3]' 'environment.high=[1,3]' dataset.segments=1500 'dataset.speed=[8,11]' 'dataset.law.speed=[8,11]' \
-  'dataset.law.points=[13,3,5]' training.steps=1500 certification.corridor.runs=40 certification.corridor.duration=20 \
-  certification.corridor.attack_steps=20000 evaluation.episodes=6 evaluation.episode_s=30 "$@"
+root=runs
+size=(dataset.segments=4000 training.steps=6000 certification.corridor.runs=150 evaluation.episodes=40 evaluation.episode_s=60)
+if [ "${1:-}" = --small ]; then
+  shift
+  size=(dataset.segments=1500 training.steps=1500 certification.corridor.runs=40 certification.corridor.duration=20 evaluation.episodes=6
+    evaluation.episode_s=30)
+fi
+for word in "$@"; do case $word in root=*) root=${word#root=} ;; esac; done
+car=(vehicle=simulator vehicle.env=tests.plants.simulators:highway 'environment.low=[0.35,-3]' 'environment.high=[1,3]' "${size[@]}")
+python -m sfkd_jax.train +experiment=s3 name=highway "${car[@]}" 'dataset.speed=[8,11]' 'dataset.law.speed=[8,11]' 'dataset.law.points=[13,3,5]' \
+  certification.corridor.attack_steps=20000 controller=mppi_path_300 'evaluation.systems=[self]' "$@"
+for samples in 1500 1; do
+  python -m sfkd_jax.evaluate +experiment=s3_body name="highway_nominal_$samples" "${car[@]}" controller.mppi.num_samples=$samples \
+    'evaluation.systems=[nominal]' "$@"
+done
+python -m experiments.simulator "$root"

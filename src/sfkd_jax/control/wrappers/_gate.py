@@ -57,6 +57,13 @@ LATEST = 1.2
 SLOWING = 0.8
 """Speed [m/s] by which a lost vehicle's reference is below its speed: braking."""
 
+AS_LATE = 0.5
+"""Of the limits: how far a late observation may be from the estimate of its time. A
+wrong position is behind on the path as well, and rarely that close.
+"""
+OUTSIDE = 0.5
+"""How far outside the box of ξ the model still predicts, as a share of its width."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
@@ -127,9 +134,9 @@ class Gate(Stateful):
     the vehicle was up to 1.2 s ago, is late, and corrects the estimates since then.
     After `patience` a finite measurement is believed, whatever it says, and the
     certificate is not claimed for a `trial`; without one, or 6 s of late ones, the
-    reference speed falls, and the vehicle stops. Outside the conditions, and without a
-    box of ξ, ξ⁻ is a point that keeps its heading and speed, and the limits are what a
-    vehicle can reach.
+    reference speed falls, and the vehicle stops. Far outside the conditions, and
+    without a box of ξ, ξ⁻ is a point that keeps its heading and speed; outside them the
+    limits are what a vehicle can reach.
 
     An environment or reference that is not finite is replaced by the last one, and by
     the middle of the box of e before the first; the road moves on with every step.
@@ -285,7 +292,8 @@ class Gate(Stateful):
         gap = preview.along - state.along
         shifted = (jnp.abs(gap) > self._reach(state, periods)) & moving
         earlier, off, past = self._earlier(state, coordinates, preview.road[0, 0], gap)
-        late = jnp.all(seen & (jnp.abs(earlier) <= grown)) & preview.on_time & shifted
+        late = jnp.all(seen & (jnp.abs(earlier) <= AS_LATE * grown))
+        late &= preview.on_time & shifted
         # Not for ever: the reference may have moved, and the car has stopped by then.
         longest = round(PATIENCE_AHEAD / self.dt)
         usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
@@ -423,7 +431,11 @@ class Gate(Stateful):
         fiber = model.fiber(fold(model, params), nearest)
         ahead = expected_coordinates(model, fiber, xi, nu, road)
         inside = self.conditions.hold(xi, road) & all_finite(ahead)
-        return jnp.where(inside, ahead, onward), inside, usual
+        # Somewhat outside it is still better than a point that keeps its heading.
+        low, high = map(jnp.asarray, self.conditions.state)
+        more = OUTSIDE * (high - low)
+        near = jnp.all((low - more <= xi) & (xi <= high + more)) & all_finite(ahead)
+        return jnp.where(near, ahead, onward), inside, usual
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
