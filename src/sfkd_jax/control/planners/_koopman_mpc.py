@@ -146,7 +146,7 @@ class _LiftedTracking:
         # The first step has the curvature of the first point, others that of both ends.
         mean = 0.5 * (curvature[1:] + curvature[:-1])
         over = jnp.concatenate([curvature[:1], mean])
-        targets = PathTarget(reference, over, None)
+        targets = PathTarget(reference, over)
         return RolloutSetup(predictor._replace(lift=None), first, targets, known)
 
     def step(
