@@ -147,7 +147,7 @@ def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tm
     assert identity(tmp_path / "moved") != here
 
 
-BOX = ([0.4, -5], [0.9, 5])
+BOX, PRETRAINED = ([0.4, -5], [0.9, 5]), Path(sfkd_jax.__file__).parent / "pretrained"
 
 
 class Car:
@@ -221,11 +221,10 @@ def test_logs_that_make_no_vehicle_are_refused_in_one_line(driven, more, says):
 @pytest.fixture(scope="module")
 def under_policy(tmp_path_factory):
     """A run directory, and five runs of the car under its policy."""
-    root, car = tmp_path_factory.mktemp("collect"), Car()
+    root = tmp_path_factory.mktemp("collect")
     folder = root / "car" / "sfkd_path" / "seed=0"
-    pretrained = Path(sfkd_jax.__file__).parent / "pretrained"
-    shutil.copytree(pretrained / "kinematic_path", folder)
-    drive_under(sfkd_jax.load(folder), car, root / "recorded", BOX, range(5), 6)
+    shutil.copytree(PRETRAINED / "kinematic_path", folder)
+    drive_under(sfkd_jax.load(folder), Car(), root / "recorded", BOX, range(5), 6)
     return root
 
 
