@@ -79,11 +79,10 @@ def roads(plant, case, given):
         wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
         return envs.at[:, 1].set(wind(envs[:, 1], forces))
 
-    actual = made.envs
+    made = made._replace(observed_envs=made.envs)
     if case.force:
         keys = jax.random.split(force_key, given.episodes)
-        actual = jax.jit(jax.vmap(disturbed))(keys, made.envs)
-    made = made._replace(envs=actual, observed_envs=made.envs)
+        made = made._replace(envs=jax.jit(jax.vmap(disturbed))(keys, made.envs))
     return made, jax.random.split(drive_key, given.episodes)
 
 

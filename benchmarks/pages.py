@@ -43,7 +43,7 @@ LAWS = ("law", "law_plant", "law_nominal")
 
 
 def corridor():
-    """What the certificates of the shipped policies say, and how they drive S3."""
+    """The certificates of the shipped policies and of a foreign car, and how they drive."""
     certificates = [read(PRETRAINED / f"{car}_path/certificate.json") for car in CARS]
     rows = read("experiments/corridor.json")["rows"]
 
@@ -53,40 +53,45 @@ def corridor():
             return "leaves the lane"
         return f"{np.mean(row['rmse_mm']):.{digits}f}"
 
-    about = [document["corridor"] for document in certificates]
-    bounds = [f"**{one['corridor_m']:.3f}**" for one in about]
-    low_high = [one["coverage_ci95"] for one in about]
+    other = read("experiments/simulator.json")
+    about = [*(document["corridor"] for document in certificates), other]
+    rates = (one["outputs"]["position"]["alpha"] for one in certificates)
+    inside = ((one["coverage"], *one["coverage_ci95"]) for one in about)
     lines = [
-        ["**corridor: bound on the distance from the path [m]**", *bounds],
         [
-            "share of fresh one-minute runs inside, with its 95 % interval",
-            *(
-                f"{one['coverage']:.3f} ({low:.3f} to {high:.3f})"
-                for one, (low, high) in zip(about, low_high, strict=True)
-            ),
+            "**corridor: bound on the distance from the path [m]**",
+            *(f"**{one['corridor_m']:.3f}**" for one in about),
+        ],
+        [
+            "share of fresh runs inside, with its 95 % interval",
+            *("{:.3f} ({:.3f} to {:.3f})".format(*one) for one in inside),
         ],
         [
             "share of S3 runs inside, never calibrated on",
-            *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about),
+            *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about[:-1]),
+            f"{other['coverage_s3']:.3f}",
         ],
         [
             "contraction rate, proved (metric of the distance)",
-            *(f"{one['outputs']['position']['alpha']:.3f}" for one in certificates),
+            *(f"{rate:.3f}" for rate in [*rates, other["alpha"]]),
         ],
         [
             "S3, lateral RMSE [mm]; of a planner that knows the car",
             *(f"{error(car, 'sfkd')}; {error(car, 'oracle')}" for car in CARS),
+            f"{other['rmse_mm']:.1f}; –",
         ],
         [
-            "the same, nominal bicycle",
+            "the same, MPPI with the textbook bicycle",
             *(error(car, "nominal", 0) for car in CARS),
+            f"{other['nominal_mppi_rmse_mm']:.0f}",
         ],
         [
             "the law alone: of the learned model; of the true car; of the bicycle [mm]",
             *("; ".join(error(car, law) for law in LAWS) for car in CARS),
+            "–",
         ],
     ]
-    return table(["", *CARS], lines)
+    return table(["", *CARS, "[highway-env](docs/your-vehicle.md)"], lines)
 
 
 def measured():

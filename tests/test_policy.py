@@ -40,8 +40,8 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
     assert type(tuned) is type(after)
     _, later, quiet = act(trained.params, tuned, known[2], ENV, straight(20))
     assert act._cache_size() == 1
-    # All samples are the plan itself.
-    np.testing.assert_allclose(quiet["cost"], quiet["mean_cost"], rtol=1e-3)
+    # All samples are the plan itself, but that of the law alone.
+    np.testing.assert_allclose(quiet["cost"], quiet["mean_cost"], rtol=1e-2)
     with pytest.raises(ValueError, match="unknown entry of tuning temprature"):
         control.tuned(later, temprature=1.0)
     with pytest.raises(ValueError, match="holds no state of a planner"):

@@ -58,7 +58,9 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
 def test_too_few_trajectories_for_the_level_are_refused(count, level):
     random = np.random.default_rng(0)
     reference, table = scores(random, 50), scores(random, count + 1)
-    message = f"{count} calibration trajectories are too few for level {level}"
+    message = (
+        f"{count} calibration trajectories are too few for certification.level={level}"
+    )
     with pytest.raises(ValueError, match=message):
         conformal_bounds(reference, table[:-1], level=level)
     assert np.all(np.isfinite(conformal_bounds(reference, table, level=level)))

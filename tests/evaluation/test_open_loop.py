@@ -8,7 +8,7 @@ import pytest
 from helpers import dataset, driven, jit, model_and_params
 
 from sfkd_jax import evaluation, models, plants
-from sfkd_jax.experiment.data import least_squares
+from sfkd_jax.experiment.identified import least_squares
 from sfkd_jax.types import Trajectory
 
 DT = 0.1

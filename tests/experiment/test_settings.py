@@ -85,7 +85,7 @@ def use(name, value):
         ("evaluation.systems", ["self", "oracel"]),
         ("dataset.shares", [0.5, 0.5, 0.5, 0.5]),
         ("training.window", 51),
-        ("model.rank", 7),
+        ("model.lift", "states"),
         ("controller.mppi.smoothing_window", 4),
         ("dataset.speed", [13.0, 7.0]),
     ],

@@ -62,7 +62,9 @@ AS_LATE = 0.5
 wrong position is behind on the path as well, and rarely that close.
 """
 OUTSIDE = 0.5
-"""How far outside the box of ξ the model still predicts, as a share of its width."""
+"""How far outside the box of ξ the model predicts a car that is not seen, as a share of
+its width.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,7 +242,8 @@ class Gate(Stateful):
 
         estimate = after.past[0, :-1]
         applied = Applied(control, road[0], info.get("env_estimate", env))
-        expected, modelled, _ = self._predict(params, estimate, applied)
+        unseen = ~measured[LATERAL]
+        expected, modelled, _ = self._predict(params, estimate, applied, unseen)
         tested = self._expect(tested, params, xi, applied, info, clear & clean)
         innovation = _difference(coordinates, state.expected)
         report: Any = {
@@ -387,7 +390,8 @@ class Gate(Stateful):
         if "causes" in info:
             found = input_error(info["causes"], applied.road)
             applied = applied._replace(control=applied.control + found)
-        expected, inside, usual = self._predict(params, xi, applied)
+        unseen = jnp.asarray(False)
+        expected, inside, usual = self._predict(params, xi, applied, unseen)
         control, road, env = applied
         nearest = self.conditions.nearest(env)
         turned = self.dt * turning_rate(self.law, xi, control, road, nearest)
@@ -414,7 +418,7 @@ class Gate(Stateful):
         return jnp.where(state.modelled & on_time, tight, wide)
 
     def _predict(
-        self, params: Params, xi: PathState, applied: Applied
+        self, params: Params, xi: PathState, applied: Applied, unseen: Bool[Array, ""]
     ) -> tuple[PathState, Bool[Array, ""], Bool[Array, ""]]:
         """ξ one step later, whether the model says so, and if ν is as in its data."""
         control, road, env = applied
@@ -431,11 +435,12 @@ class Gate(Stateful):
         fiber = model.fiber(fold(model, params), nearest)
         ahead = expected_coordinates(model, fiber, xi, nu, road)
         inside = self.conditions.hold(xi, road) & all_finite(ahead)
-        # Somewhat outside it is still better than a point that keeps its heading.
+        # A car that is not seen drives on its model somewhat outside as well: a point
+        # that keeps its heading is worse. A measurement is not compared with that.
         low, high = map(jnp.asarray, self.conditions.state)
         more = OUTSIDE * (high - low)
         near = jnp.all((low - more <= xi) & (xi <= high + more)) & all_finite(ahead)
-        return jnp.where(near, ahead, onward), inside, usual
+        return jnp.where(inside | (unseen & near), ahead, onward), inside, usual
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
