@@ -149,7 +149,7 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
     vertices = np.asarray(explicit.operators.vertices)
     if name == "state":
         # Its z is the one body state, and the weights read the control too.
-        operator = fiber.A.at(one.controls[0])
+        operator, *_ = model.step.__self__._terms(fiber, one.controls[0])
         A, mixture = operator.summed(), np.asarray(operator.weights)
     else:
         A = fiber.A

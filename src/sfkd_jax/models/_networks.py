@@ -35,26 +35,14 @@ class Weights(NamedTuple):
     multipliers: tuple[Float[Array, " _"], ...] = ()
 
 
-class Biases(NamedTuple):
-    """b_k(u, e) = gain_k(e) u + offset_k(e) for every layer of a network and one e."""
-
-    gains: tuple[Float[Array, "_ control"], ...] = ()
-    offsets: tuple[Float[Array, " _"], ...] = ()
-
-    def at(self, control: Float[Array, " control"]) -> tuple[Float[Array, " _"], ...]:
-        """Return the biases for one scaled control."""
-        return tuple(
-            gain @ control + offset
-            for gain, offset in zip(self.gains, self.offsets, strict=True)
-        )
-
-
 def apply(
     matrices: Sequence[Float[Array, "_ _"]],
     biases: Sequence[Float[Array, " _"]],
     z: Float[Array, " _"],
 ) -> Float[Array, " _"]:
-    """Return W_L tanh(… tanh(W_1 z + b_1) …) + b_L."""
+    """Return W_L tanh(… tanh(W_1 z + b_1) …) + b_L; b_L without matrices."""
+    if not matrices:
+        return biases[-1]
     for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):
         z = jnp.tanh(matrix @ z + bias)
     return matrices[-1] @ z + biases[-1]

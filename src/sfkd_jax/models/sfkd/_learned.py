@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._networks import SMALL, Biases, Free, Sandwich, Weights, bounded
+from sfkd_jax.models._networks import SMALL, Free, Sandwich, Weights, bounded
 from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
 from sfkd_jax.types import Scalar
 
@@ -37,16 +36,15 @@ class SharedWeights(NamedTuple):
 
 
 class PerEnvironment(NamedTuple):
-    """Functions of e: mixture of the vertices, B(e), biases, rotation, embedding.
+    """Functions of e: mixture of the vertices, biases, rotation, embedding.
 
-    A mixture that reads u as well is the one layer of biases before its softmax.
+    Biases are gain(e) u + offset(e). Those before a tanh are one table: of residual,
+    decoder, forcing; those of outputs another: residual with B(e) u, decoder, logits.
     """
 
-    mixture: Float[Array, " vertex"] | Biases
-    B: Float[Array, "rank control"]
-    residual: Biases
-    decoder: Biases
-    forcing: Biases
+    mixture: Float[Array, " vertex"] | None  # None if its logits are in the table
+    gains: tuple[Float[Array, "_ control"], ...]
+    offsets: tuple[Float[Array, " _"], ...]
     tangents: Float[Array, " plane"]
     embedding: Float[Array, " embedding"]
 
@@ -98,22 +96,24 @@ class Learned(nn.Module):
         self.input_head = nn.Dense(self.rank * self.control)
         # A car whose state is its speed alone has no plane, but no layer is empty.
         self.tangent_head = nn.Dense(max(self.rank // 2, 1), kernel_init=SMALL)
+        # Of every bias, a gain for each control and an offset.
+        entries = self.control + 1
         # Weights of networks do not depend on e, only biases do: one bound for all e.
         if self.kind is not None:
             sizes = self.rank, self.residual_hidden, self.rank
             self.residual_weights = self.kind(*sizes)
             self.residual_head = nn.Dense(
-                self._bias_size(self.residual_hidden, self.rank), kernel_init=SMALL
+                (sum(self.residual_hidden) + self.rank) * entries, kernel_init=SMALL
             )
         if self.pose:
             # Three outputs, the increment of the pose, whatever the body state has.
             self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
-            self.decoder_head = nn.Dense(self._bias_size(self.decoder_hidden, 3))
+            self.decoder_head = nn.Dense((sum(self.decoder_hidden) + 3) * entries)
             self.log_decoder_bound = self.param(
                 "log_decoder_bound", nn.initializers.constant(1.0), ()
             )
         if self.forcing_hidden:
-            self.forcing_head = nn.Dense(self.forcing_hidden * (self.control + 1))
+            self.forcing_head = nn.Dense(self.forcing_hidden * entries)
             self.forcing_weights = self.param(
                 # Zeros: the extension begins as the model without it.
                 "forcing",
@@ -184,42 +184,36 @@ class Learned(nn.Module):
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
         """Return the functions of e; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
-        residual = decoder = forcing = Biases()
+
+        def table(head: nn.Dense) -> Array:
+            return head(embedding).reshape(-1, self.control + 1)
+
+        B = self.input_head(embedding).reshape(self.rank, self.control)
+        outer = [jnp.pad(B, ((0, 0), (0, 1)))]
+        hidden = [outer[0][:0]]
         if self.kind is not None:
-            widths = (*self.residual_hidden, self.rank)
-            residual = self._biases(self.residual_head(embedding), widths)
+            rows = table(self.residual_head)
+            hidden.append(rows[: -self.rank])
+            outer[0] += rows[-self.rank :]
         if self.pose:
-            widths = (*self.decoder_hidden, 3)
-            decoder = self._biases(self.decoder_head(embedding), widths)
+            rows = table(self.decoder_head)
+            hidden.append(rows[:-3])
+            outer.append(rows[-3:])
         if self.forcing_hidden:
-            forcing = self._biases(self.forcing_head(embedding), (self.forcing_hidden,))
-        mixture = self.mixture_head(embedding)
-        # Evaluated in any case, so that the ablation has the same parameters.
-        tangents = self.tangent_head(embedding)
+            hidden.append(table(self.forcing_head))
+        mixture = None if self.scheduled else nn.softmax(self.mixture_head(embedding))
+        if self.scheduled:
+            outer.append(table(self.mixture_head))
+        tables = jnp.concatenate(hidden), jnp.concatenate(outer)
         return PerEnvironment(
             # On the simplex by construction: a mixture of contractions contracts.
-            mixture=self._biases(mixture, (self.vertices,))
-            if self.scheduled
-            else nn.softmax(mixture),
-            B=self.input_head(embedding).reshape(self.rank, self.control),
-            residual=residual,
-            decoder=decoder,
-            forcing=forcing,
-            tangents=tangents,
+            mixture=mixture,
+            gains=tuple(table[:, :-1] for table in tables),
+            offsets=tuple(table[:, -1] for table in tables),
+            # Evaluated in any case, so that the ablation has the same parameters.
+            tangents=self.tangent_head(embedding),
             embedding=embedding,
         )
-
-    def _bias_size(self, hidden: Sequence[int], outputs: int) -> int:
-        # (control + 1) per unit: a gain for each control and an offset.
-        return (sum(hidden) + outputs) * (self.control + 1)
-
-    def _biases(self, flat: Array, widths: Sequence[int]) -> Biases:
-        """Cut one flat vector into gains and offsets per layer."""
-        table = flat.reshape(sum(widths), self.control + 1)
-        # Inner edges only, as `split` wants them.
-        edges = list(accumulate(widths))[:-1]
-        gains, offsets = (jnp.split(x, edges) for x in (table[:, :-1], table[:, -1]))
-        return Biases(tuple(gains), tuple(offsets))
 
 
 def _couplings(

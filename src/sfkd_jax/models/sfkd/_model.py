@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -10,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._networks import FRAMES, Biases, Encoder, Sandwich, apply
+from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich, apply
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
@@ -55,35 +57,24 @@ class Mixture(NamedTuple):
     with respect to the A_j needs no matrix for each e.
     """
 
-    weights: Float[Array, " vertex"]
+    weights: Any  # (vertex,); None for A(e, u), of which they are known with u
     vertices: Float[Array, "vertex rank rank"]
 
     def __matmul__(self, z: Float[Array, " rank"]) -> Float[Array, " rank"]:
         """Return A(e) z."""
-        # Vertices first: products with vectors only, never a matrix for this e.
-        return self.weights @ (self.vertices @ z)
+        # [A_1 … A_n] [w_1 z; …; w_n z]: one product, and never a matrix for this e.
+        beside = jnp.moveaxis(self.vertices, 0, 1).reshape(z.shape[0], -1)
+        return beside @ (self.weights[:, None] * z).ravel()
 
     def summed(self) -> Float[Array, "rank rank"]:
         """Return A(e), for many steps under one e."""
         return jnp.tensordot(self.weights, self.vertices, axes=1)
 
 
-class Scheduled(NamedTuple):
-    """A(e, u) = Σ_j w_j A_j with weights w = softmax(G(e) u + h(e))."""
-
-    logits: Biases
-    vertices: Float[Array, "vertex rank rank"]
-
-    def at(self, control: Float[Array, " control"]) -> Mixture:
-        """Return the operator for one scaled control."""
-        # On the simplex whatever u is, and no function of z: it contracts as before.
-        return Mixture(jax.nn.softmax(self.logits.at(control)[0]), self.vertices)
-
-
 class SfkdFiber(NamedTuple):
     """All that depends on e; a network without matrices is absent."""
 
-    A: Scheduled | Mixture | Float[Array, "rank rank"]
+    A: Mixture | Float[Array, "rank rank"]
     local: PerEnvironment
     residual: tuple[Float[Array, "_ _"], ...]
     decoder: tuple[Float[Array, "_ _"], ...]
@@ -146,12 +137,13 @@ class LatentModel:
         shared = self.shared(params)
         scaled = self.space.scaled_env(env, self.environment)
         local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
-        if isinstance(local.mixture, Biases):
-            operator = Scheduled(local.mixture, shared.vertices)
-        else:
-            operator = Mixture(local.mixture, shared.vertices)
-            if isinstance(params, Folded):
-                operator = operator.summed()
+        # For controls as they are: a rollout then scales none of its own.
+        gains = tuple(gain / self.space.control_scale for gain in local.gains)
+        offsets = _moved(gains, local.offsets, -self.space.control_mean)
+        local = local._replace(gains=gains, offsets=offsets)
+        operator = Mixture(local.mixture, shared.vertices)
+        if local.mixture is not None and isinstance(params, Folded):
+            operator = operator.summed()
         return SfkdFiber(
             A=operator,
             local=local,
@@ -179,24 +171,38 @@ class LatentModel:
         self, fiber: SfkdFiber, latent: PosedLatent, control: Control
     ) -> PosedLatent:
         """Advance z and the pose by one sampling period."""
-        space, local = self.space, fiber.local
-        # Every function of u and e is a bias, which no Lipschitz bound in z sees.
-        u = space.scaled_control(control)
-        operator = fiber.A.at(u) if isinstance(fiber.A, Scheduled) else fiber.A
-        z = operator @ latent.z + local.B @ u
-        if fiber.forcing:
-            z = z + fiber.forcing[0] @ jnp.tanh(local.forcing.at(u)[0])
-        # Decided by the shape of the weights, that is, when the program is traced.
-        if fiber.residual:
-            z = z + apply(fiber.residual, local.residual.at(u), latent.z)
+        A, residual, decoder = self._terms(fiber, control)
+        z = A @ latent.z + apply(fiber.residual, residual, latent.z)
         # Along a path there is no pose: that of the start stays.
         if not fiber.decoder:
             return PosedLatent(latent.pose, z)
         # From z before the step: the motion during the period starts there.
-        motion = apply(fiber.decoder, local.decoder.at(u), latent.z)
+        space, motion = self.space, apply(fiber.decoder, decoder, latent.z)
         # Mean plus scale: an output of 0 is the average motion of the data.
         motion = space.increment_mean + space.increment_scale * motion
         return PosedLatent(compose(latent.pose, motion), z)
+
+    def _terms(self, fiber: SfkdFiber, control: Control) -> tuple[Any, Any, Any]:
+        """Return A and the biases of residual and decoder: every function of u and e.
+
+        The residual's last bias includes B(e) u + f(u, e). No Lipschitz bound in z sees
+        a bias.
+        """
+        hidden, outer = _moved(fiber.local.gains, fiber.local.offsets, control)
+        layers = *fiber.residual[:-1], *fiber.decoder[:-1]
+        edges = accumulate(layer.shape[0] for layer in layers)
+        *biases, forcing = jnp.split(hidden, list(edges))
+        rank, inner = fiber.readout.shape[1], max(len(fiber.residual) - 1, 0)
+        pose = 3 if fiber.decoder else 0
+        direct, motion, logits = jnp.split(outer, [rank, rank + pose])
+        A = fiber.A
+        # Decided by the shape of the weights, that is, when the program is traced.
+        if fiber.forcing:
+            direct += fiber.forcing[0] @ jnp.tanh(forcing)
+        if isinstance(A, Mixture) and A.weights is None:
+            # On the simplex whatever u is, and no function of z: it contracts as ever.
+            A = A._replace(weights=jax.nn.softmax(logits))
+        return A, (*biases[:inner], direct), (*biases[inner:], motion)
 
     def decode(self, fiber: SfkdFiber, latent: PosedLatent) -> State:
         """Return the state of a latent."""
@@ -236,7 +242,7 @@ class LatentModel:
 
     def hinge(self, fiber: SfkdFiber, latent: PosedLatent, control: Control) -> Scalar:
         """Return the weighted penalty max(0, ||∂r/∂z||_2 − β)² (eq:contr_loss)."""
-        at = fiber.local.residual.at(self.space.scaled_control(control))
+        _, at, _ = self._terms(fiber, control)
         jacobian = jax.jacobian(lambda z: apply(fiber.residual, at, z))(latent.z)
         # As the paper has it: a penalty at sampled points, which proves nothing.
         excess = jnp.linalg.norm(jacobian, 2) - self.beta
@@ -371,6 +377,13 @@ def sfkd(
         )
     encoder = None if state_lift else Encoder(rank, encoder_hidden, linear_lift)
     return LatentModel(space, learned, encoder, environment, soft_penalty, beta).model()
+
+
+def _moved(
+    gains: Sequence[Array], offsets: Sequence[Array], u: Control
+) -> tuple[Array, ...]:
+    """Return gain u + offset for every table."""
+    return tuple(gain @ u + offset for gain, offset in zip(gains, offsets, strict=True))
 
 
 def rotate_planes(
