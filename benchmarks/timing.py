@@ -119,7 +119,6 @@ def sfkd_jax():
         noise="white",
         noise_std=(NOISE,) * CONTROLS,
         temperature=TEMPERATURE,
-        unroll=4,
     )
 
     def act(memory, z, target):

@@ -35,7 +35,6 @@ def main(samples=96, seconds=4.0, figure=None):
         horizon=HORIZON,
         noise_std=(0.5,) * CHEETAH.action_size,
         effective_samples=8.0,
-        unroll=1,  # one copy of the physics to compile
     )
 
     def step(carry, _):

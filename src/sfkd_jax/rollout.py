@@ -191,16 +191,15 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     second program for the rest.
     """
     count = jax.tree.leaves(items)[0].shape[0]
-    size = min(size, count)
-    # Padding repeats the first items: real data, so that no NaN appears in it.
-    rows = (jnp.arange(-(-count // size) * size) % count).reshape(-1, size)
-    results = jax.lax.map(
-        lambda chosen: jax.vmap(function)(
-            jax.tree.map(lambda leaf: leaf[chosen], items)
-        ),
-        rows,
-    )
-    # Padding is at the end, since rows run through the items in order.
+    if count <= size:
+        return jax.vmap(function)(items)
+
+    def batched(leaf: Array) -> Array:
+        # Padding repeats the first items: real data, so that no NaN appears in it.
+        padded = jnp.concatenate([leaf, leaf[: -count % size]])
+        return padded.reshape(-1, size, *leaf.shape[1:])
+
+    results = jax.lax.map(jax.vmap(function), jax.tree.map(batched, items))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
 
 

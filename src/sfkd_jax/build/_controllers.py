@@ -56,7 +56,7 @@ QUADRATIC = ("koopman_mpc",)
 """Planners that solve a quadratic program: they search around no law."""
 _DECIDED = (
     *("dt", "wheelbase", "speed_loop", "control_low", "control_high"),
-    *("env_low", "env_high", "estimate_env", "inner", "model", "law", "unroll"),
+    *("env_low", "env_high", "estimate_env", "inner", "model", "law"),
     *("conditions", "reads_env", "test"),
 )
 """Arguments of controllers that vehicle, environment and model decide, and those for

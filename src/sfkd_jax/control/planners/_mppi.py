@@ -148,7 +148,8 @@ def shrunk(
 
     for each control, with the positive part alone; s² estimates the variance of ν̄.
     """
-    variance = jnp.einsum("m,tmc->c", weights**2, (samples - mean[:, None]) ** 2)
+    squares = (samples - mean[:, None]) ** 2
+    variance = jnp.sum(jnp.einsum("m,tmc->tc", weights**2, squares), axis=0)
     moved = mean - plan
     # Away from 0: without a move there is nothing to shrink.
     share = 1.0 - variance / (jnp.sum(moved**2, axis=0) + 1e-12)

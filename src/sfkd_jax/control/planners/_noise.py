@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sfkd_jax.control.planners._planner import Planner
+from sfkd_jax.control.planners._planner import Planner, Plans
 from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, UnitInterval, check_choice
 from sfkd_jax.types import Control, Key
 
-Noise: TypeAlias = Float[Array, "horizon sample control"]
 KINDS = ("ar1", "white", "spline")
 
 
@@ -48,35 +46,32 @@ class SamplingPlanner(Planner):
                 f"noise_knots must lie in [2, {self.horizon}], got {self.noise_knots}"
             )
 
-    def draw(self, key: Key, std: Control) -> Noise:
+    def draw(self, key: Key, std: Control) -> Plans:
         """Return noise of a standard deviation for each control."""
-        steps = self.noise_knots if self.noise == "spline" else self.horizon
-        shape = (steps, self.num_samples, std.shape[0])
-        white = jax.random.normal(key, shape) * std[None, None]
+        knots = self.noise_knots if self.noise == "spline" else self.horizon
+        shape = (knots, self.num_samples, std.shape[0])
+        white = jax.random.normal(key, shape)
         if self.noise == "white":
-            return white
-        if self.noise == "spline":
-            return between_knots(white, self.horizon)
-        fresh = jnp.sqrt(1.0 - self.noise_correlation**2)
+            return white * std[None, None]
+        if self.noise == "ar1":
+            factor = autoregression(self.horizon, self.noise_correlation)
+        else:
+            factor = spline(self.horizon, self.noise_knots)
+            # Rows of unit length: the same spread at every step.
+            factor = factor / np.linalg.norm(factor, axis=1, keepdims=True)
+        # Full precision: accelerators otherwise round float32 factors to ten bits.
+        table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
+        noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
+        # Scaled last: XLA would draw numbers one by one if a scale followed at once.
+        return noise * std[None, None]
 
-        def step(before: Array, new: Array) -> tuple[Array, Array]:
-            now = self.noise_correlation * before + fresh * new
-            return now, now
 
-        # From the first white value: it has the stationary variance already.
-        _, rest = jax.lax.scan(step, white[0], white[1:])
-        return jnp.concatenate([white[:1], rest])
-
-
-def between_knots(knots: Float[Array, "knot sample control"], horizon: int) -> Noise:
-    """Interpolate between values at equidistant knots, with the spread of the knots."""
-    factor = spline(horizon, knots.shape[0])
-    # Rows of unit length: the same spread at every step.
-    factor = factor / np.linalg.norm(factor, axis=1, keepdims=True)
-    # Full precision: accelerators otherwise round float32 factors to ten bits.
-    precision = jax.lax.Precision.HIGHEST
-    table = jnp.asarray(factor, dtype=float)
-    return jnp.einsum("tk,kmc->tmc", table, knots, precision=precision)
+def autoregression(horizon: int, rho: float) -> Float[np.ndarray, "horizon horizon"]:
+    """Weights of w in ε; ε_0 = w_0, which has the stationary variance already."""
+    steps = np.arange(horizon)
+    factor = np.tril(rho ** np.abs(steps[:, None] - steps))
+    factor[:, 1:] *= np.sqrt(1.0 - rho**2)
+    return factor
 
 
 def spline(horizon: int, knots: int) -> Float[np.ndarray, "horizon knots"]:

@@ -14,10 +14,13 @@ from jaxtyping import Array, Bool, Float, UInt32
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
+from sfkd_jax.rollout import in_batches
 from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
+TOGETHER = 400
+"""Largest number of samples that are rolled out at once."""
 C = TypeVar("C")
 Memory = TypeVar("Memory")
 
@@ -123,8 +126,6 @@ class Planner(Stateful):
         horizon: T, number of steps.
         noise_std: scale of a perturbation, one entry a control; initial value in
             `Tuning`.
-        unroll: number of steps of a rollout that are compiled as one, which saves time
-            where steps are short; the plan is the same up to rounding.
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
     """
@@ -133,7 +134,6 @@ class Planner(Stateful):
     _: KW_ONLY
     horizon: AtLeastOne = 20
     noise_std: tuple[Positive, ...] = (0.02, 0.3)
-    unroll: AtLeastOne = 2
     env_low: tuple[float, ...] | None = None
     env_high: tuple[float, ...] | None = None
 
@@ -258,35 +258,31 @@ class Planner(Stateful):
         return control, after, info
 
     def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
-        """Roll out all plans in one scan over the horizon."""
-        task, count, axes = self.task, plans.shape[1], (0, 0, None, None)
-        numbers = jnp.arange(self.horizon)
+        """Roll out all plans, some hundred at a time."""
+        task, numbers = self.task, jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
-        step = jax.vmap(partial(task.step, tuning.cost, setup.context), axes)
 
-        def body(carry: Any, inputs: Any) -> Any:
-            costs, samples = carry
-            after, worst = step(samples, *inputs), None
+        def body(sample: Any, inputs: Any) -> Any:
+            after = task.step(tuning.cost, setup.context, sample, *inputs)
+            worst, seen = None, (after.state, after.control, *inputs[1:])
             if task.constraint is not None:
-                each = jax.vmap(partial(task.constraint, tuning.constraints), axes)
-                every = each(after.state, after.control, *inputs[1:])
+                every = task.constraint(tuning.constraints, *seen)
                 # NaN compares as kept, so it must not get through.
-                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every), axis=1)
-            along = after.control, after.perturbation, after.state, worst
-            return (costs + after.cost, after.sample), along
+                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
+            return after.sample, (after._replace(sample=None), worst)
 
-        samples = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), setup.start
+        def one(plan: Plan) -> Any:
+            return jax.lax.scan(body, setup.start, (plan, setup.targets, places))[1]
+
+        # Batches of one size, that a core keeps in its cache.
+        size = -(-plans.shape[1] // -(-plans.shape[1] // TOGETHER))
+        along, worst = jax.tree.map(
+            lambda leaf: jnp.swapaxes(leaf, 0, 1),
+            in_batches(one, jnp.swapaxes(plans, 0, 1), size=size),
         )
-        (costs, _), (controls, allowed, states, violations) = jax.lax.scan(
-            body,
-            (jnp.zeros(count, plans.dtype), samples),
-            (plans, setup.targets, places),
-            # A single plan gains nothing from unrolling.
-            unroll=self.unroll if count > 1 else 1,
-        )
-        worst = None if violations is None else jnp.max(violations, axis=0)
-        return Evaluated(costs, controls, allowed, states, worst)
+        worst = None if worst is None else jnp.max(worst, axis=0)
+        costs = jnp.sum(along.cost, axis=0)
+        return Evaluated(costs, along.control, along.perturbation, along.state, worst)
 
 
 def iterate(
