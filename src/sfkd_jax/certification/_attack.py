@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
 
 from sfkd_jax.certification._claims import FLOAT32, Box, Claims, attack_limits, decoders
 from sfkd_jax.certification._core import Matrix, Vector
@@ -207,6 +206,8 @@ def _steepest(
             # A logarithm: far from the maximum slopes differ by orders of magnitude.
             jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30)
         )
+
+    from scipy.optimize import minimize  # slow to import, and not to verify
 
     with_gradient = jax.jit(jax.value_and_grad(loss, argnums=1))
     jacobian = jax.jit(

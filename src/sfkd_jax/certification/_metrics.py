@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import minimize
 
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
@@ -166,6 +165,8 @@ def propose_metric(
     `rows` is C, `gaps` are d of the worst steps of every run, not of the calibration
     split. The search starts at `start`, the Lyapunov matrix of the operators, or at I.
     """
+    from scipy.optimize import minimize  # slow to import, and not to verify
+
     vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
     rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])
     entries = len(lower[0])
