@@ -40,6 +40,9 @@ def read(name):
 
 LAWS = ("law", "law_plant", "law_nominal")
 """The law that ships, and those of the true car and of the textbook bicycle."""
+TEXTBOOK = ("nominal", "law_stanley", "law_pure_pursuit")
+OTHERS = ("nominal_mppi", "stanley", "pure_pursuit")
+"""The same in experiments/simulator.json."""
 
 
 def corridor():
@@ -81,9 +84,9 @@ def corridor():
             f"{other['rmse_mm']:.1f}; –",
         ],
         [
-            "the same, MPPI with the textbook bicycle",
-            *(error(car, "nominal", 0) for car in CARS),
-            f"{other['nominal_mppi_rmse_mm']:.0f}",
+            "the same: MPPI with the textbook bicycle; Stanley; pure pursuit",
+            *("; ".join(error(car, name, 0) for name in TEXTBOOK) for car in CARS),
+            "; ".join(f"{other[f'{name}_rmse_mm']:.0f}" for name in OTHERS),
         ],
         [
             "the law alone: of the learned model; of the true car; of the bicycle [mm]",

@@ -10,6 +10,6 @@ for vehicle in dynamic kinematic; do
     certification.corridor.attack_steps=1000000 evaluation.episodes=16 "$@")
   python -m sfkd_jax.certify "${run[@]}"
   python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300
-  # The law alone: of the learned model, of the textbook bicycle, of the true car.
-  python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300 controller.mppi.num_samples=1 'evaluation.systems=[law,law_nominal,law_plant]'
+  # The law alone: of the learned model, of the textbook bicycle, of the true car; Stanley, pure pursuit.
+  python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300 controller.mppi.num_samples=1 'evaluation.systems=[law,law_nominal,law_plant,law_stanley,law_pure_pursuit]'
 done

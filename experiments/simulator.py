@@ -4,6 +4,15 @@ import json
 import sys
 from pathlib import Path
 
+NAMES = {
+    ("sfkd_path", "measured"): "",
+    ("sfkd_path", "estimated"): "estimated_",
+    ("law_stanley", "measured"): "stanley_",
+    ("law_pure_pursuit", "measured"): "pure_pursuit_",
+    ("nominal", "none"): "nominal_mppi_",
+}
+"""Rows by system and source of e."""
+
 
 def read(run, name):
     """A document of a run."""
@@ -22,9 +31,10 @@ def main():
         "coverage_s3": round(corridor["by_scenario"]["s3"]["coverage"], 3),
         "alpha": round(certificate["outputs"]["position"]["alpha"], 3),
     }
-    runs = {"": "", "nominal_mppi_": "_nominal_1500", "hand_made_law_": "_nominal_1"}
-    for name, run in runs.items():
-        row = read(root / f"highway{run}", "results")["rows"][0]
+    rows = read(root / "highway", "results")["rows"]
+    rows += read(root / "highway_nominal", "results")["rows"]
+    for row in rows:
+        name = NAMES[row["system"], row["env"]]
         found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
         found[f"{name}departures"] = row["departures"]
     print(json.dumps(found))

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # From a simulator that nobody here wrote to a car in its corridor (docs/your-vehicle.md): the dynamic bicycle of highway-env, whose grip and
-# side force switch. Beside it, in the same run: MPPI with the textbook bicycle, and a hand-made path-following law alone. Ends with one line of JSON.
+# side force switch. In the same run: the same with grip and force estimated, MPPI with the textbook bicycle, Stanley's law and pure pursuit (their
+# constants chosen on this car). Ends with one line of JSON.
 #
 #     bash experiments/simulator.sh [--small] [root=DIR and other Hydra overrides]
 set -euo pipefail
@@ -13,10 +14,12 @@ if [ "${1:-}" = --small ]; then
 fi
 for word in "$@"; do case $word in root=*) root=${word#root=} ;; esac; done
 car=(vehicle=simulator vehicle.env=tests.plants.simulators:highway 'environment.low=[0.35,-3]' 'environment.high=[1,3]' "${size[@]}")
-python -m sfkd_jax.train +experiment=s3 name=highway "${car[@]}" 'dataset.speed=[8,11]' 'dataset.law.speed=[8,11]' 'dataset.law.points=[13,3,5]' \
-  certification.corridor.attack_steps=20000 controller=mppi_path_300 'evaluation.systems=[self]' "$@"
-for samples in 1500 1; do
-  python -m sfkd_jax.evaluate +experiment=s3_body name="highway_nominal_$samples" "${car[@]}" controller.mppi.num_samples=$samples \
-    'evaluation.systems=[nominal]' "$@"
-done
+path=(+experiment=s3 name=highway "${car[@]}" 'dataset.speed=[8,11]' 'dataset.law.speed=[8,11]' 'dataset.law.points=[13,3,5]'
+  certification.corridor.attack_steps=20000 controller=mppi_path_300)
+python -m sfkd_jax.train "${path[@]}" 'evaluation.systems=[self]' "$@"
+# A force acts as it is, a wind by its square; the errors are those of open_loop.json.
+python -m sfkd_jax.evaluate "${path[@]}" 'evaluation.systems=[self]' environment.source=estimated controller.adaptation.power=1 \
+  '+controller.adaptation.model_error=[9e-4,2e-4,6e-3,7e-3,4e-3]' "$@"
+python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 'evaluation.systems=[law_stanley,law_pure_pursuit]' "$@"
+python -m sfkd_jax.evaluate +experiment=s3_body name=highway_nominal "${car[@]}" 'evaluation.systems=[nominal]' "$@"
 python -m experiments.simulator "$root"

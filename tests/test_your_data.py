@@ -228,6 +228,15 @@ def under_policy(tmp_path_factory):
     return root
 
 
+def test_an_environment_in_another_unit_is_told_of_while_recording(under_policy):
+    """N for kN, degrees for radians: the policy drives on, and claims nothing."""
+    policy = sfkd_jax.load(under_policy / "car" / "sfkd_path" / "seed=0")
+    says = r"e is outside its box: friction \[-\] 0\.3 … 0\.9, .*The unit\?"
+    wide = ([0.5, 4000.0], [0.6, 5000.0])
+    with pytest.warns(UserWarning, match=says):
+        drive_under(policy, Car(), under_policy / "wrong", wide, [0], 0.3)
+
+
 def collected(root, runs="recorded", level=0.8):
     words = ("name=car", f"root={root}", f"collect.path={root / runs}")
     return collect.run(settings(*words, f"certification.level={level}"))

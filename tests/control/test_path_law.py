@@ -13,7 +13,7 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import plants, policy
-from sfkd_jax.control import derive_path_law
+from sfkd_jax.control import TEXTBOOK, derive_path_law, textbook_law
 from sfkd_jax.experiment import data, identified
 from sfkd_jax.geometry import path_state, path_step
 from sfkd_jax.types import BODY
@@ -47,6 +47,27 @@ def test_a_turn_at_a_point_of_the_tables_is_steady(derived):
     known = law.curvature(turn.control[0], jnp.asarray(8.0), env)
     np.testing.assert_allclose(known, curvature, rtol=1e-3)
     assert np.isnan(law.curvature(jnp.asarray(1.0), jnp.asarray(8.0), env))
+
+
+@pytest.mark.parametrize("name", TEXTBOOK)
+def test_a_law_of_a_textbook_is_the_one_of_its_geometry(derived, name):
+    """Small errors: Stanley's front axle, and the arc to the point that is pursued."""
+    law = derived[1]
+    length, k, v, curve = 2.7, 1.2, jnp.asarray(8.0), jnp.asarray(0.0)
+    made, env = textbook_law(law, name, k, wheelbase=length), jnp.asarray([0.6, 0.0])
+    turn = law.turn(curve, v, env)
+    aside, turned = 0.01, 0.004
+    errors = jnp.zeros(len(turn.state)).at[:2].set([aside, turned])
+    moved = made(turn.state + errors, curve, v, env) - turn.control
+    front = aside + 0.5 * length * np.sin(turned)
+    far = k * v
+    below = -aside * np.cos(turned) - far * np.sin(turned)
+    expected = {
+        "stanley": -turned - np.arctan(k * front / v),
+        "pure_pursuit": np.arctan(2.0 * length * below / far**2),
+    }
+    np.testing.assert_allclose(moved[0], expected[name], rtol=1e-3)
+    np.testing.assert_array_equal(made.gain[..., 1, :], law.gain[..., 1, :])
 
 
 @pytest.mark.parametrize("env", [(0.3, 8.0), (0.3, -8.0), (0.9, 0.0), (0.55, 5.0)])

@@ -52,7 +52,7 @@ IDENTIFIED = "vehicle"
 """Kind of the file that holds the model of a vehicle of logs."""
 MODELS = models.FACTORIES | {"own": models.own}
 """Models of settings: those of the package, and one from outside by name."""
-LAW_MODELS = ("learned", "nominal", "plant")
+LAW_MODELS = ("learned", "nominal", "plant", *control.TEXTBOOK)
 LAWS_ALONE = {f"law_{model}": model for model in LAW_MODELS}
 """System of an evaluation -> whose law drives alone in it."""
 Directory = Annotated[str, BelowRoot()]

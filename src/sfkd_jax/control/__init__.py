@@ -10,9 +10,11 @@ from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
 from sfkd_jax.control.laws._feedback import no_feedback as no_feedback
 from sfkd_jax.control.laws._feedback import path_errors as path_errors
 from sfkd_jax.control.laws._feedback import path_feedback as path_feedback
+from sfkd_jax.control.laws._path_law import TEXTBOOK as TEXTBOOK
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
+from sfkd_jax.control.laws._path_law import textbook_law as textbook_law
 from sfkd_jax.control.laws._recovery import NEAR as NEAR
 from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner

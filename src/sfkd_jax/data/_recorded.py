@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -52,6 +53,9 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
     columns, dt = run_columns(trained), trained.vehicle.dt
     names = [columns.time, *columns.state, *columns.control, *columns.environment]
     rows, size = count(), len(columns.environment) - len(INPUTS)
+    limits = trained.interface["environment"].values()
+    told = (f"{one} {a:.3g} … {b:.3g}" for one, a, b in zip(*limits, strict=False))
+    box = ", ".join(told)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     # A line at a time: what was driven before a crash is kept.
     with Path(path).open("x", encoding="utf-8", buffering=1) as file:
@@ -62,6 +66,8 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
         ) -> None:
             if "perturbation" not in info:
                 raise ValueError("only a policy with a shield has runs to collect")
+            if not info["env_inside"]:
+                warnings.warn(f"e is outside its box: {box}. The unit?", stacklevel=2)
             time = dt * next(rows) if time is None else time
             row = [time, *observation, *info["path_state"][:2], *control, *env[:size]]
             row += [*info["perturbation"], *info["road"]]

@@ -14,7 +14,13 @@ import numpy as np
 
 from sfkd_jax import build, models, store
 from sfkd_jax.build import LoggedVehicleSettings
-from sfkd_jax.control import PathLaw, derive_path_law, law_from_arrays
+from sfkd_jax.control import (
+    TEXTBOOK,
+    PathLaw,
+    derive_path_law,
+    law_from_arrays,
+    textbook_law,
+)
 from sfkd_jax.data import (
     PARTS,
     SCENARIOS,
@@ -30,7 +36,7 @@ from sfkd_jax.data import (
 )
 from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.options import LogSettings, Settings
-from sfkd_jax.plants import Vehicle, check_step
+from sfkd_jax.plants import Vehicle, along_path, check_step
 from sfkd_jax.settings import arguments
 from sfkd_jax.types import BODY, Key, Step, Trajectory
 
@@ -39,6 +45,8 @@ SWITCHING, OPEN_LOOP, ALONE = 2, 3, 4
 """Streams folded into the data set's seed; simulation and split use 0 and 1."""
 QUIET = (1e-6, 2e-6)
 """Excitation of the law alone: none, but with a logarithm."""
+LOST = 1.0
+"""Largest lateral error that counts when laws are compared [m]."""
 STRAYS, SLACK = 1.5, 5.0
 """A law is accepted up to this factor of what its model promises, and so many mm."""
 
@@ -89,10 +97,10 @@ def _simulate(settings: Settings) -> Dataset:
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
     trajectories = jax.jit(_generator(settings))(drive_key)
-    along_path = bool(settings.along_path)
-    labels = segment_scenarios(options.segments, along_path=along_path)
+    along = bool(settings.along_path)
+    labels = segment_scenarios(options.segments, along_path=along)
     trajectories, labels = _without_faults(settings, trajectories, labels)
-    if along_path:
+    if along:
         check_on_path(trajectories)
     return split(
         trajectories,
@@ -202,7 +210,8 @@ def derive_law(settings: Settings) -> PathLaw:
     """
     along: Any = settings.along_path
     plant = build.build_vehicle(settings.vehicle)
-    steps = {"plant": lambda: plant.step, "nominal": lambda: plant.nominal}
+    steps = {"plant": lambda: plant.step}
+    steps |= dict.fromkeys(("nominal", *TEXTBOOK), lambda: plant.nominal)
     # A model of logs is a learned one already.
     logged = isinstance(settings.vehicle, LoggedVehicleSettings)
     learned = partial(_learned_step, settings, plant)
@@ -220,10 +229,45 @@ def derive_law(settings: Settings) -> PathLaw:
         **arguments(along.law, derive_path_law),
     )
     law = jax.jit(derive)()
+    if (name := along.law.model) in TEXTBOOK:
+        stray = _strays(settings, plant, plant.step)
+        law = min(
+            (
+                textbook_law(law, name, k, wheelbase=plant.wheelbase)
+                for k in TEXTBOOK[name]
+            ),
+            key=stray,
+        )
+        store.print_message(f"{name}: {stray(law):.1f} mm")
     # Beside itself a model of logs would find nothing.
-    if along.law.model != "plant" and step is not plant.step:
+    elif name != "plant" and step is not plant.step:
         _check_law(settings, plant, law, step)
     return law
+
+
+def _strays(
+    settings: Settings, plant: Vehicle, step: Step
+) -> Callable[[PathLaw], float]:
+    """Return law -> how far from its paths a step drives under it alone [mm, RMS]."""
+    quiet = dict.fromkeys(("steering_excitation", "speed_excitation"), QUIET)
+    excited = settings.along_path.law.perturbation  # pyright: ignore
+    options: Any = arguments(settings.dataset, generate_along_path) | quiet
+    options |= {"segments": 240, "steps": 100, **settings.environment.box}
+    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), ALONE)
+
+    @jax.jit
+    def drive(law: PathLaw) -> Trajectory:
+        loop = along_path(plant._replace(step=step), law, perturbation=excited)
+        return generate_along_path(loop, seed, **options)
+
+    def lateral(law: PathLaw) -> float:
+        (runs,) = _without_faults(settings, drive(law))
+        # A vehicle that leaves its path is lost, however far.
+        off = jnp.clip(runs.states[..., BODY.start], -LOST, LOST)
+        found = 1e3 * float(jnp.sqrt(jnp.mean(off**2)))
+        return found if np.isfinite(found) else np.inf
+
+    return lateral
 
 
 def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> None:
@@ -232,18 +276,7 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
     Where the vehicle strays much farther than the model, the model is not that of the
     vehicle: a learned one is refused, the textbook's is what was asked for.
     """
-    quiet = dict.fromkeys(("steering_excitation", "speed_excitation"), QUIET)
-    options = arguments(settings.dataset, generate_along_path) | quiet
-    options |= {"segments": 240, "steps": 100, **settings.environment.box}
-    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), ALONE)
-
-    def lateral(step: Step) -> float:
-        loop = build.build_loop(plant._replace(step=step), law)
-        runs = jax.jit(partial(generate_along_path, loop, **options))(seed)
-        (runs,) = _without_faults(settings, runs)
-        return 1e3 * float(jnp.sqrt(jnp.mean(runs.states[..., BODY.start] ** 2)))
-
-    found, promised = lateral(plant.step), lateral(step)
+    found, promised = (_strays(settings, plant, one)(law) for one in (plant.step, step))
     name = settings.along_path.law.model  # pyright: ignore
     line = (
         f"the law of the {name} model keeps vehicle {plant.name} within {found:.1f} mm "

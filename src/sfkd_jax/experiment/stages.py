@@ -221,6 +221,8 @@ def _open_loop_document(
         "dt": plant.dt,
         "trajectories": dataset.test.controls.shape[0],
         **columns(own),
+        # Of ξ, as `control.Adaptation.model_error` takes them, or of all states.
+        "one_step_rmse": np.asarray(own, np.float64)[0, int(along) :].tolist(),
         "baselines": {name: columns(one) for name, one in of_others.items()},
     }
 

@@ -22,6 +22,7 @@ import hashlib
 import json
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,12 @@ class ExportedController:
                 given[name] = np.asarray(elapsed, np.float32)
         values = self._act(*given.values())
         state, info = (self._named("act", root, values) for root in ("state", "info"))
+        if not np.all(info.get("env_inside", True)):
+            box = zip(*self.manifest["environment"].values(), strict=True)
+            told = ", ".join(
+                f"{name} {low:.3g} … {high:.3g}" for name, low, high in box
+            )
+            warnings.warn(f"e is outside its box: {told}. The unit?", stacklevel=2)
         if origin.any():
             for name in {"predicted_states", "reference"} & set(info):
                 moved: Any = _shifted(info[name], origin)

@@ -63,7 +63,7 @@ def film_of(
     kinds = [
         [one for one in whole if one.system == "sfkd"],
         [one for one in whole if one.system == "nominal"],
-        [one for one in rivals if one.system not in (*NO_MODEL, "sfkd")],
+        [one for one in rivals if not one.system.startswith((*NO_MODEL, "sfkd"))],
     ]
     chosen = [kind[0] for kind in kinds if kind] or whole[:1]
     if not chosen:

@@ -57,6 +57,8 @@ SYSTEMS = {
     "law": Look("Law alone", "#a0522d", (1.5, 1)),
     "law_nominal": Look("Law alone, of the nominal bicycle", "#cd853f", (1.5, 1)),
     "law_plant": Look("Law alone, of the true plant", "#6b4226", (1.5, 1)),
+    "law_stanley": Look("Stanley's law", "#e9967a", (1.5, 1)),
+    "law_pure_pursuit": Look("Pure pursuit", "#bc8f8f", (1.5, 1)),
     "nominal": Look("Nominal", SECOND, width=1.4),
     "oracle": Look("Oracle", "#3c3c3c", (3, 1.2), 1.4),
 }

@@ -12,8 +12,10 @@ from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, millimetr
 from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, Row
 from sfkd_jax.report.style import family, label, rank, scenario_label
 
-NO_MODEL = ("nominal", "oracle", "law", "law_nominal", "law_plant")
-"""Systems without a learned model; their names imply whether they observe e."""
+NO_MODEL = ("nominal", "oracle", "law")
+"""Beginnings of systems without a learned model, whose names imply whether they observe
+e; so do those of ours.
+"""
 SAMPLINGS = {
     "feedback": "sampling around a feedback law",
     "plain": "plain sampling",
@@ -55,7 +57,7 @@ def name_of(row: Row) -> str:
         return f"{shown} (e estimated)"
     in_name = env == "measured" and shown.endswith(" e")  # as in "reads e"
     # Where the name or the kind of system says it, brackets would only repeat it.
-    if in_name or system in NO_MODEL or system.startswith("sfkd"):
+    if in_name or system.startswith((*NO_MODEL, "sfkd")):
         return shown
     return shown + {"measured": " (e)", "none": " (no e)"}.get(env, "")
 

@@ -30,6 +30,12 @@ STEERING_SLOPES = (0.5, 5.0)
 limit of the tyres.
 """
 
+TEXTBOOK = {
+    "stanley": (0.5, 1.0, 2.0, 4.0, 8.0),
+    "pure_pursuit": (0.3, 0.5, 0.8, 1.2, 2.0),
+}
+"""Values of the one constant of a steering law from a textbook, see `textbook_law`."""
+
 PathStep: TypeAlias = Callable[[Array, Control, Scalar, Array], Array]
 """(ξ, u, κ, e) -> ξ one step later."""
 
@@ -134,6 +140,39 @@ def _corners(
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
     """Return the law from a dictionary of arrays, such as `law._asdict()`."""
     return PathLaw(**{name: jnp.asarray(arrays[name]) for name in PathLaw._fields})
+
+
+def textbook_law(
+    law: PathLaw, name: str, constant: float, *, wheelbase: Positive
+) -> PathLaw:
+    """Return a law with the steering of a textbook in place of its gains.
+
+        "stanley":       δ = δ* − ψ − k (e_y + ½ L ψ) / v
+        "pure_pursuit":  δ = δ* − 2 L (e_y + T v ψ) / (T v)²
+
+    ψ = e_ψ − e_ψ*; both are linear in the errors here, which are small along a path.
+    Stanley's law steers the front axle, half a wheelbase ahead of the position.
+
+    Args:
+        law: whose steady turns and drive are used.
+        name: of `TEXTBOOK`.
+        constant: k [1/s], or the time T [s] of the point that is pursued.
+        wheelbase: L [m].
+
+    Source: Hoffmann et al. (2007); Coulter (1992).
+    """
+    axes = law.gain.ndim - 2
+    speed = jnp.linspace(law.low[1], law.high[1], law.gain.shape[1])
+    if name == "stanley":
+        lateral = constant / speed
+        heading = 1.0 + 0.5 * wheelbase * lateral
+    else:
+        lateral = 2.0 * wheelbase / (constant * speed) ** 2
+        heading = constant * speed * lateral
+    gain, zero = law.gain, jnp.zeros_like(speed)
+    steering = [lateral, heading, *[zero] * (gain.shape[-1] - 2)]
+    rows = jnp.stack(steering, -1).reshape(1, -1, *[1] * (axes - 2), gain.shape[-1])
+    return law._replace(gain=gain.at[..., 0, :].set(rows))
 
 
 def derive_path_law(

@@ -71,8 +71,8 @@ class Adaptation(Stateful):
 
     An extended Kalman filter estimates (ξ, θ). Between steps f stays or jumps, which
     two filters joined by a Markov chain follow (interacting multiple models); with
-    `estimate_env` each of them exists for every friction of a grid, and f is the wind.
-    Per control step:
+    `estimate_env` each of them exists for every friction of a grid, f is the wind, and
+    nothing else is estimated. Per control step:
 
     1. the measured ξ corrects (ξ, θ), see `Estimator.follow` for those that do not fit;
     2. e takes up the force within E, a compensation the rest, u the input errors;
@@ -96,6 +96,7 @@ class Adaptation(Stateful):
         env_low: lower end of E = (friction, wind).
         env_high: upper end of E; the wind's box is symmetric.
         estimate_env: infer e as well; the `env` argument of `act` is not read.
+        power: of the second entry of e in its side force: 2 of a wind, 1 of a force.
         jump: probability that the force jumps between two steps.
         jump_size: standard deviation of a jump, relative to the largest force of E.
         force_drift: standard deviation of its change over a step without a jump.
@@ -124,6 +125,7 @@ class Adaptation(Stateful):
     env_low: tuple[float, ...]
     env_high: tuple[float, ...]
     estimate_env: bool = False
+    power: Positive = 2.0
     jump: Fraction = 0.03
     jump_size: Positive = 0.8
     force_drift: Positive = 0.05
@@ -167,8 +169,10 @@ class Adaptation(Stateful):
         """Return the state before the first control step."""
         noise, _ = self._noise
         # A wide prior where e is unknown; elsewhere the force is only what e misses.
-        force = 1.0 if self.estimate_env else 0.1
-        prior = jnp.asarray([*noise, force, *self.slow_prior], dtype=float) ** 2
+        force = [0.1, *self.slow_prior]
+        if self.estimate_env:  # in a window this short, not told apart from the rest
+            force = [1.0, *[0.0] * len(self.slow_prior)]
+        prior = jnp.asarray([*noise, *force], dtype=float) ** 2
         count = self._estimator.frictions.shape[0]
         belief = Belief(
             bank=Bank(
@@ -243,10 +247,11 @@ class Adaptation(Stateful):
                 drift = self.friction_drift
                 chain = transition_matrix(*ends, points, drift, self.dwell)
             jumps = jnp.tile(jnp.array([1.0 - self.jump, self.jump]), (2, 1))
-            drift = jnp.asarray([*error, self.force_drift, *self.slow_drift]) ** 2
+            slow = self.slow_drift if not self.estimate_env else [0.0] * (CAUSES - 1)
+            drift = jnp.asarray([*error, self.force_drift, *slow]) ** 2
             drifts = jnp.stack([drift, drift.at[len(error)].set(self.jump_size**2)])
             return Estimator(
-                loop=Loop(self.model, self.law, low, high),
+                loop=Loop(self.model, self.law, low, high, self.power),
                 transition=jnp.kron(chain, jumps),
                 frictions=jnp.repeat(frictions, 2),
                 sensors=jnp.asarray(noise) ** 2,

@@ -161,15 +161,17 @@ class Loop(NamedTuple):
     law: PathLaw  # around which it was learned
     low: Environment  # lower end of E
     high: Environment  # upper end of E; wind in [-high, high]
+    power: float = 2.0  # of the wind in its side force
 
     def relative_force(self, env: Environment) -> Scalar:
-        """Return the side force w|w| relative to the largest one in E."""
-        return env[WIND] * jnp.abs(env[WIND]) / self.high[WIND] ** 2
+        """Return the side force, w|w| of a wind, relative to the largest one in E."""
+        share = env[WIND] / self.high[WIND]
+        return share * jnp.abs(share) ** (self.power - 1.0)
 
     def with_force(self, env: Environment, force: Scalar) -> Environment:
         """Return e with the wind of a relative side force."""
         # The root has no derivative at 0; nothing differentiates by the force.
-        root = jnp.sign(force) * jnp.sqrt(jnp.abs(force))
+        root = jnp.sign(force) * jnp.abs(force) ** (1.0 / self.power)
         return env.at[WIND].set(self.high[WIND] * root)
 
     def split_force(
