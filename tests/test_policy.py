@@ -13,7 +13,7 @@ import pytest
 from helpers import straight
 
 import sfkd_jax
-from sfkd_jax import control, demo, models, plants, policy
+from sfkd_jax import control, demo, policy
 from sfkd_jax.types import Controller
 
 KEY, ENV = jax.random.key(0), jnp.asarray([0.7, 0.0])
@@ -107,17 +107,6 @@ def test_strict_numerics_of_the_caller_reach_no_policy(setting, value):
         trained = policy.load(demo.SHIPPED / "kinematic_path")
         state, act = trained.controller.init(KEY), trained.controller.act
         jax.eval_shape(act, trained.params, state, *inputs)
-
-
-def test_late_controls_are_predicted_by_the_vehicle_not_by_its_closed_loop():
-    trained = load("kinematic_path")
-    with pytest.raises(ValueError, match=r"use models.physics\(plant.step\)"):
-        control.delay_compensated(trained.controller, trained.model, delay=1)
-    known = models.physics(plants.kinematic().step)
-    late = control.delay_compensated(trained.controller, known, delay=2)
-    state = control.tuned(late.init(KEY), effective_samples=20.0)
-    arguments = trained.params, state, start("kinematic"), ENV, straight(20)
-    assert jax.eval_shape(late.act, *arguments)[2]["arrival_state"].shape == (4,)
 
 
 def scripted(controls):

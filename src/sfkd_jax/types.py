@@ -248,8 +248,6 @@ class ControllerInfo(TypedDict, total=False):
     causes_std: Float[Array, " 5"]  # standard deviations of the estimates
     rejected: Bool[Array, ""]  # nothing was learned from the measurement
     adapting: Bool[Array, ""]  # the causes do not predict worse than none
-    # delay_compensated
-    arrival_state: Float[Array, " state"]  # at which the control arrives, predicted
     # Shield
     margin: Scalar  # distance of the nominal model to the edge of its corridor [m]
     intervention: Scalar  # share of the request that was removed, in [0, 1]

@@ -81,14 +81,6 @@ def registered(name):
     return build.build_controller(settings, model, PLANT, **BOX), params
 
 
-def delay_compensated():
-    """With actuators that are two steps late."""
-    controller, params = mppi(FEEDBACK)
-    return control.delay_compensated(
-        controller, model_and_params("nominal")[0], delay=2
-    ), params
-
-
 def around_law(model, law):
     """A tiny planner along a path."""
     task = control.following_law(
@@ -172,7 +164,6 @@ VARIANTS = {
     "mppi_constrained": constrained,
 }
 WRAPPERS = {
-    "delay_compensated": delay_compensated,
     "shielded": shielded,
     "adaptive": adaptive,
 }

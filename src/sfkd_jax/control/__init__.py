@@ -40,7 +40,6 @@ from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
 from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
-from sfkd_jax.control.wrappers._delay import delay_compensated as delay_compensated
 from sfkd_jax.control.wrappers._gate import Box as Box
 from sfkd_jax.control.wrappers._gate import Conditions as Conditions
 from sfkd_jax.control.wrappers._gate import Gate as Gate
