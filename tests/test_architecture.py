@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
 CORE = {"types", "geometry", "rollout", "ranges", "paths", "lanes"}
-COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "doctor", "demo"}
+COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
 PLANT = CORE | {"plants", "scenarios"}

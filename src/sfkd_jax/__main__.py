@@ -11,7 +11,7 @@ from sfkd_jax import __version__
 from sfkd_jax.settings import did_you_mean
 
 COMMANDS = ("demo", "train", "generate", "certify", "evaluate", "compare")
-COMMANDS += ("collect", "report", "export", "doctor")
+COMMANDS += ("collect", "report", "export")
 """Modules that are commands, in the order in which they are listed."""
 VERSION = f"sfkd_jax {__version__}"
 
