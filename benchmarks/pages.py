@@ -12,6 +12,7 @@ import numpy as np
 
 from experiments import results
 from experiments.results import markdown as table
+from experiments.simulator import PREFIXES
 
 ROOT = Path(__file__).parents[1]
 PRETRAINED = ROOT / "src" / "sfkd_jax" / "pretrained"
@@ -40,9 +41,6 @@ def read(name):
 
 LAWS = ("law", "law_plant", "law_nominal")
 """The law that ships, and those of the true car and of the textbook bicycle."""
-TEXTBOOK = ("nominal", "law_stanley", "law_pure_pursuit")
-OTHERS = ("nominal_mppi", "stanley", "pure_pursuit")
-"""The same in experiments/simulator.json."""
 
 
 def corridor():
@@ -85,8 +83,8 @@ def corridor():
         ],
         [
             "the same: MPPI with the textbook bicycle; Stanley; pure pursuit",
-            *("; ".join(error(car, name, 0) for name in TEXTBOOK) for car in CARS),
-            "; ".join(f"{other[f'{name}_rmse_mm']:.0f}" for name in OTHERS),
+            *("; ".join(error(car, name, 0) for name in PREFIXES) for car in CARS),
+            "; ".join(f"{other[f'{name}rmse_mm']:.0f}" for name in PREFIXES.values()),
         ],
         [
             "the law alone: of the learned model; of the true car; of the bicycle [mm]",

@@ -20,9 +20,6 @@ if [ "${#cores[@]}" -gt 1 ]; then
   failed=0
   for share in "${shares[@]}"; do wait "$share" || failed=1; done
   trap - INT TERM
-  if [ "$failed" = 1 ]; then
-    echo "a process failed; the same command continues" >&2
-    exit 1
-  fi
+  [ "$failed" = 0 ] || { echo "a process failed; the same command continues" >&2 && exit 1; }
 fi
 python -m sfkd_jax.compare "+experiment=$name" "$@"

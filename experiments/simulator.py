@@ -4,40 +4,31 @@ import json
 import sys
 from pathlib import Path
 
-NAMES = {
-    ("sfkd_path", "measured"): "",
-    ("sfkd_path", "estimated"): "estimated_",
-    ("law_stanley", "measured"): "stanley_",
-    ("law_pure_pursuit", "measured"): "pure_pursuit_",
-    ("nominal", "none"): "nominal_mppi_",
-}
-"""Rows by system and source of e."""
+import numpy as np
 
-
-def read(run, name):
-    """A document of a run."""
-    return json.loads(next(run.glob(f"*/seed=0/{name}.json")).read_text("utf-8"))
+PREFIXES = {"nominal": "nominal_mppi_", "law_stanley": "stanley_"}
+PREFIXES |= {"law_pure_pursuit": "pure_pursuit_"}
+"""Of what is printed of a system; ours has none, and "estimated_" where e is."""
 
 
 def main():
     """Print it."""
-    root = Path(sys.argv[1])
-    corridor = (certificate := read(root / "highway", "certificate"))["corridor"]
+    runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
+    certificate = json.loads((runs[0] / "certificate.json").read_text("utf-8"))
+    corridor = certificate["corridor"]
     found = {
-        "law": corridor["conditions"]["law_model"],
-        "corridor_m": round(corridor["corridor_m"], 3),
-        "coverage": round(corridor["coverage"], 3),
-        "coverage_ci95": [round(end, 3) for end in corridor["coverage_ci95"]],
-        "coverage_s3": round(corridor["by_scenario"]["s3"]["coverage"], 3),
-        "alpha": round(certificate["outputs"]["position"]["alpha"], 3),
+        name: corridor[name] for name in ("corridor_m", "coverage", "coverage_ci95")
     }
-    rows = read(root / "highway", "results")["rows"]
-    rows += read(root / "highway_nominal", "results")["rows"]
-    for row in rows:
-        name = NAMES[row["system"], row["env"]]
-        found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
-        found[f"{name}departures"] = row["departures"]
-    print(json.dumps(found))
+    found["coverage_s3"] = corridor["by_scenario"]["s3"]["coverage"]
+    found["alpha"] = certificate["outputs"]["position"]["alpha"]
+    for run in runs:
+        for row in json.loads((run / "results.json").read_text("utf-8"))["rows"]:
+            estimated = row["env"] == "estimated"
+            name = "estimated_" if estimated else PREFIXES.get(row["system"], "")
+            found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
+            found[f"{name}departures"] = row["departures"]
+    rounded = {name: np.round(value, 3).tolist() for name, value in found.items()}
+    print(json.dumps({"law": corridor["conditions"]["law_model"]} | rounded))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,7 @@ root=runs
 size=(dataset.segments=4000 training.steps=6000 certification.corridor.runs=150 evaluation.episodes=40 evaluation.episode_s=60)
 if [ "${1:-}" = --small ]; then
   shift
-  size=(dataset.segments=1500 training.steps=1500 certification.corridor.runs=40 certification.corridor.duration=20 evaluation.episodes=6
-    evaluation.episode_s=30)
+  size=(dataset.segments=1500 training.steps=1500 certification.corridor.{runs=40,duration=20} evaluation.{episodes=6,episode_s=30})
 fi
 for word in "$@"; do case $word in root=*) root=${word#root=} ;; esac; done
 car=(vehicle=simulator vehicle.env=tests.plants.simulators:highway 'environment.low=[0.35,-3]' 'environment.high=[1,3]' "${size[@]}")
