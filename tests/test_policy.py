@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import straight
+from helpers import same, straight
 
 import sfkd_jax
 from sfkd_jax import control, demo, policy
@@ -157,6 +157,26 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
     assert not np.any(info["healthy"][0])
     assert np.all(worst[2:4] > 0.02)  # as far as the filter lets them
     assert info["mine"].shape == lateral.shape
+
+
+def test_what_planners_add_to_the_model_reaches_no_guard():
+    """And of what is not finite the law drives, inside the corridor."""
+    trained, x = load("kinematic_path"), start("kinematic").at[1].set(0.05)
+    guarded = trained.guard(scripted(jnp.tile(jnp.asarray([0.1, 0.0]), (20, 1))))
+    act, guard = jax.jit(trained.controller.act), jax.jit(guarded.act)
+    told, memory, weights = [], trained.controller.init(KEY), trained.params.weights
+    for size in (0.0, 1.0, 1e30, np.nan):
+        more = jax.tree.map(lambda leaf, size=size: leaf + size, weights["planning"])
+        params = trained.params._replace(weights={**weights, "planning": more})
+        told.append(guard(params, guarded.init(KEY), x, ENV, straight(20)))
+        u, _, info = act(params, memory, x, ENV, straight(20))
+        assert bool(info["shield_healthy"])
+        assert float(info["margin"]) > 0.0
+        if not size < 1e30:
+            assert not bool(info["healthy"])
+            lawful = trained.law(jnp.asarray([0.05, 0.0, 10.0]), 0.0, 10.0, ENV)
+            np.testing.assert_allclose(u, lawful, atol=1e-5)
+    assert all(same(one, told[0], rtol=0, atol=0) for one in told[1:])
 
 
 def test_a_planner_in_a_guard_sees_what_the_gate_believes():

@@ -202,6 +202,8 @@ class Model(NamedTuple):
         fitting: how the parameters are fitted.
         structure: what is known by construction.
         along_path: whether states and controls are those of `geometry`.
+        planning: the model that planners roll out in place of this one, with the same
+            params; None for this one. Nothing is certified of it.
     """
 
     init: Callable[[Key], Params]
@@ -216,6 +218,7 @@ class Model(NamedTuple):
     fitting: Fitting = Fitting()
     structure: Structure = Structure()
     along_path: bool = False
+    planning: Model | None = None
 
 
 class ControllerInfo(TypedDict, total=False):

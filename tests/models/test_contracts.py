@@ -17,6 +17,7 @@ from helpers import (
     driven,
     jit,
     model_and_params,
+    path_space,
     same,
     space,
 )
@@ -24,8 +25,8 @@ from helpers import (
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
 from sfkd_jax.models.sfkd import RESIDUALS
-from sfkd_jax.rollout import fold, rollout
-from sfkd_jax.types import POSE
+from sfkd_jax.rollout import Given, fold, rollout
+from sfkd_jax.types import POSE, Structure, Trajectory
 
 EVERY = (*VARIANTS, *OTHERS, *PHYSICS)
 LEARNED = (*VARIANTS, *OTHERS)
@@ -198,6 +199,39 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
     excess = np.linalg.norm(np.asarray(slope, np.float64), 2) - 0.1
     assert excess > 0
     np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["path", "state"])
+def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
+    """Not a bit of the model itself changes, whatever is added."""
+    build = partial(models.sfkd, path_space(), **TINY | VARIANTS[name])
+    model, both = build(), build(planning_residual=True)
+    params = jit(both.init)(jax.random.key(0))
+    assert both.planning.structure == Structure()
+    draw = partial(jax.random.normal, jax.random.key(1))
+    states, controls = draw((3, 6)).at[:, 5].add(10.0), 0.01 * draw((2, 4))
+    run = Trajectory(states, controls.at[:, 3].add(9.0), 0.3 * draw((2, 2)))
+
+    @jit
+    def driven(params):
+        planning = both.planning
+        fiber = planning.fiber(params, run.envs[0])
+        first, road = jnp.split(run.controls[0], 2)
+        given = Given(fiber, planning.given(fiber, road))
+        latent = planning.encode(fiber, run.states[0])
+        split = planning.vector(planning.step(given, latent, first))
+        whole = planning.vector(planning.step(fiber, latent, run.controls[0]))
+        certified = chain(both, params, run), both.structure.explicit(params)
+        return certified, chain(planning, params, run), split, whole
+
+    alone = jit(lambda p: (chain(model, p, run), model.structure.explicit(p)))(params)
+    for size in (0.0, 0.1, 1e30, np.nan):
+        more = jax.tree.map(lambda leaf, size=size: leaf + size, params["planning"])
+        certified, planned, split, whole = driven({**params, "planning": more})
+        assert same(certified, alone, rtol=0, atol=0)
+        assert same(planned, alone[0], rtol=0, atol=0) == (size == 0.0)
+        if size < 1.0:
+            np.testing.assert_allclose(split, whole, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["sfkd", "joint", "no_contraction", "path"])

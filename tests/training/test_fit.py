@@ -7,11 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TINY, dataset, largest_file
+from helpers import TINY, VARIANTS, dataset, jit, largest_file, path_space
 
 from sfkd_jax.data import measure_space, random_windows, spread_windows
 from sfkd_jax.models import sfkd
-from sfkd_jax.training import Checkpoints, TrainingStopped, fit, multi_step_loss
+from sfkd_jax.training import (
+    Checkpoints,
+    TrainingStopped,
+    fit,
+    fit_planning,
+    multi_step_loss,
+)
+from sfkd_jax.types import Trajectory
 
 OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
 DRAW = partial(random_windows, batch=16, length=8)
@@ -126,6 +133,23 @@ def test_a_directory_holds_one_training_and_says_so(task, unbroken, capfd):
         with pytest.raises(ValueError, match=f"holds another training .*{message}"):
             train(changed, directory, **options)
     assert capfd.readouterr().err == ""
+
+
+def test_what_planners_add_is_what_the_model_lacks():
+    """Of a car whose e_y is blown aside; the model itself stays as it is."""
+    model = sfkd(path_space(), **TINY | VARIANTS["state"], planning_residual=True)
+    params, draw = jit(model.init)(jax.random.key(0)), np.random.default_rng(0)
+    states = np.tile([0.0, 0.0, 0.0, 10.0, 0.0, 0.0], (16, 9, 1))
+    controls = np.tile([0.01, 0.0, 0.0, 9.0], (16, 8, 1))
+    envs = draw.uniform([0.3, -8.0], [0.9, 8.0], (16, 8, 2))
+    states[:, 1:, 3] += 0.1 * envs[..., 1]
+    data = jax.tree.map(jnp.asarray, Trajectory(states, controls, envs))
+    draw, key, space = partial(DRAW, length=1), jax.random.key(1), path_space()
+    fitted = fit_planning(model, params, space, draw, data, key, steps=100)
+    assert same({**fitted, "planning": params["planning"]}, params)
+    loss = multi_step_loss(model.planning, space).validate
+    before, after = (loss(p, data)[1]["one_step"] for p in (params, fitted))
+    assert after < 0.5 * before
 
 
 def test_the_score_of_a_window_does_not_depend_on_the_weights(task):

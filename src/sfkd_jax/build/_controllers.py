@@ -213,6 +213,8 @@ def build_controller(
         **arguments(settings.cost, control.tracking_cost),
     )
     own = {**box, **arguments(settings.own, factory)}
+    # Here and nowhere else: all around the planner has the model that is certified.
+    rolled = model.planning or model
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
     # Whoever estimates e learns the unmeasured forces with the same filter.
@@ -225,7 +227,7 @@ def build_controller(
                 "in path coordinates: model.frame=path"
             )
         if searches is not None:
-            return factory(_task(searches, model, plant, cost, limits), **own)
+            return factory(_task(searches, rolled, plant, cost, limits), **own)
         # Of the task's settings a quadratic program has the terminal weight alone.
         weight = settings.task.terminal_weight
         return factory(model, cost, **limits, terminal_weight=weight, **own)
@@ -234,7 +236,7 @@ def build_controller(
             "a model in path coordinates needs controller.sampling=law and its law"
         )
     # The planner sees the offset; the estimator needs the model as it was learned.
-    planned = with_offset(model) if adaptive else model
+    planned, guarded = (with_offset(m) if adaptive else m for m in (rolled, model))
     task = control.following_law(
         planned,
         cost,
@@ -246,7 +248,7 @@ def build_controller(
     along = planner or factory(task, **own)
     # A shield needs a certified corridor; without one the planner drives alone.
     if certificate and certificate.get("corridor") and (planner or searches.shield):
-        along = in_corridor(along, planned, plant, law, certificate)
+        along = in_corridor(along, guarded, plant, law, certificate)
     if adaptive:
         # The filter relates forces to the largest one in E, which the box defines.
         if None in box.values():

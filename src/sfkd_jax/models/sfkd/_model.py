@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,6 +42,10 @@ from sfkd_jax.types import (
 )
 
 LIFTS = ("network", "state")
+FREE = 2
+"""Entries ν of a control along a path; κ and v_ref follow."""
+PLANNING_WIDTH, PLANNING_SCALE = 64, 0.01
+"""Of the network of `PlanningModel`, and of what it returns."""
 
 
 class PosedLatent(NamedTuple):
@@ -83,6 +88,7 @@ class SfkdFiber(NamedTuple):
     centre: Float[Array, " body"]
     # Weights of φ, or C⁻¹ where z is the state.
     encoder: Any
+    planning: Any = None  # weights of g and the e that it reads, see `PlanningModel`
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +96,14 @@ class LatentModel:
     """The functions of `Model`.
 
     `learned` is all that is learned but the encoder, which is None where z is the
-    state; the last two are of `hinge`.
+    state, and `correction`, of `PlanningModel`; the last two are of `hinge`.
     """
 
     space: Space
     learned: Learned
     encoder: Encoder | None
     environment: bool
+    correction: nn.Sequential | None
     soft_penalty: float = 0.0
     beta: float = 0.0
 
@@ -111,6 +118,11 @@ class LatentModel:
         if self.encoder is not None:
             encoder = self.encoder.init(encoder_key, body, embedding)
             params["encoder"] = encoder["params"]
+        if self.correction is not None:
+            reads = jnp.zeros(self.learned.control - FREE + env.shape[0])
+            # Another stream: the others are drawn as without it.
+            added = self.correction.init(jax.random.fold_in(key, 2), reads)
+            params["planning"] = added["params"]
         return params
 
     def _apply(self, params: Params, method: str, *inputs: Array) -> Any:
@@ -270,6 +282,61 @@ class LatentModel:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class PlanningModel(LatentModel):
+    """F + g with g = M z + N ν + m along a path, for planners alone.
+
+    M, N and m are a network of κ, v_ref and e, which all samples of a plan share: it is
+    evaluated once a step, and g is added to weights of F, so that no sample costs more.
+    """
+
+    def fiber(self, params: Params, env: Environment) -> SfkdFiber:
+        """Return the fiber of F, with what g reads."""
+        reads = self.space.scaled_env(env, self.environment)
+        known = unfold(params)["planning"], reads
+        return super().fiber(params, env)._replace(planning=known)
+
+    def step(
+        self, fiber: SfkdFiber | Given, latent: PosedLatent, control: Control
+    ) -> PosedLatent:
+        """Advance z by one sampling period."""
+        if not isinstance(fiber, Given):
+            return super().step(self.on(fiber, control[FREE:]), latent, control)
+        (A, outer), known = fiber.known
+        local = fiber.fiber.local
+        local = local._replace(gains=(local.gains[0], outer))
+        certified = fiber.fiber._replace(A=A, local=local)
+        return super().step(Given(certified, known), latent, control)
+
+    def given(self, fiber: SfkdFiber, known: Control) -> Any:
+        """Return what κ and v_ref come to: the weights that change, and offsets."""
+        on = self.on(fiber, known)
+        return (on.A, on.local.gains[1]), super().given(on, known)
+
+    def on(self, fiber: SfkdFiber, road: Control) -> SfkdFiber:
+        """Return the fiber of F that steps like F + g where κ and v_ref are these."""
+        weights, env = fiber.planning
+        mean, scale = self.space.control_mean, self.space.control_scale
+        reads = jnp.concatenate([(road - mean[FREE:]) / scale[FREE:], env])
+        assert self.correction is not None
+        table = cast(Array, self.correction.apply({"params": weights}, reads))
+        rank, A, local = fiber.readout.shape[1], fiber.A, fiber.local
+        table = PLANNING_SCALE * table.reshape(rank, -1)
+        M, N = table[:, :rank], table[:, rank:-1] / scale[:FREE]
+        m = table[:, -1] - N @ mean[:FREE]
+        # Weights of a mixture have the sum 1: what all have more, A(e, u) has more.
+        mixed = isinstance(A, Mixture)
+        A = A._replace(vertices=A.vertices + M) if mixed else A + M
+        (hidden, outer), (before, offset) = local.gains, local.offsets
+        # B(e) u comes first. Padded: a scatter takes as long as all samples do.
+        below = (0, outer.shape[0] - rank)
+        gains = hidden, outer + jnp.pad(N, (below, (0, outer.shape[1] - FREE)))
+        local = local._replace(
+            gains=gains, offsets=(before, offset + jnp.pad(m, below))
+        )
+        return fiber._replace(A=A, local=local)
+
+
 def sfkd(
     space: Space,
     *,
@@ -292,6 +359,7 @@ def sfkd(
     learn_alpha: bool = False,
     forcing_hidden: NonNegativeInt = 0,
     scheduled: bool = False,
+    planning_residual: bool = False,
 ) -> Model:
     """Stable Fiber-Koopman Residual Dynamics (eq:sfkd).
 
@@ -334,11 +402,15 @@ def sfkd(
             none. It is no function of z, so every bound still holds.
         scheduled: let the mixture of the A_j read u as well as e: along a path its
             reference speed and curvature, on which the loop's dynamics depend most.
+        planning_residual: whether planners roll out F + g, with a residual g that no
+            certificate is about: F stays what is certified, guarded and compared with.
     """
     check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
     check_choice("model.budget", budget, BUDGETS)
     check_choice("model.lift", lift, LIFTS)
+    if planning_residual and frame != "path":
+        raise ValueError("model.planning_residual needs model.frame=path")
     kind = RESIDUALS[residual]
     state_lift = lift == "state"
     if state_lift:
@@ -376,7 +448,20 @@ def sfkd(
             f"model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
         )
     encoder = None if state_lift else Encoder(rank, encoder_hidden, linear_lift)
-    return LatentModel(space, learned, encoder, environment, soft_penalty, beta).model()
+    correction = None
+    if planning_residual:
+        layers = [nn.Dense(PLANNING_WIDTH), nn.tanh, nn.Dense(PLANNING_WIDTH), nn.tanh]
+        # Zeros: planners begin with the certified model, bit for bit.
+        out, zeros = rank * (rank + FREE + 1), nn.initializers.zeros
+        correction = nn.Sequential([*layers, nn.Dense(out, kernel_init=zeros)])
+    fields = space, learned, encoder, environment, correction, soft_penalty, beta
+    model = LatentModel(*fields).model()
+    if not planning_residual:
+        return model
+    planner = PlanningModel(*fields).model()
+    # Nothing is known of it.
+    planner = planner._replace(fitting=Fitting(), structure=Structure())
+    return model._replace(planning=planner)
 
 
 def _moved(
