@@ -174,7 +174,8 @@ def test_what_planners_add_to_the_model_reaches_no_guard():
         assert float(info["margin"]) > 0.0
         if not size < 1e30:
             assert not bool(info["healthy"])
-            lawful = trained.law(jnp.asarray([0.05, 0.0, 10.0]), 0.0, 10.0, ENV)
+            xi, road = jnp.asarray([0.05, 0.0, 10.0]), jnp.asarray([0.0, 10.0])
+            lawful = trained.law(xi, *road, ENV)
             np.testing.assert_allclose(u, lawful, atol=1e-5)
     assert all(same(one, told[0], rtol=0, atol=0) for one in told[1:])
 

@@ -172,8 +172,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
             partial(random_windows, batch=options.batch * options.window, length=1),
             dataset.train,
             jax.random.fold_in(key, 1),
-            steps=options.steps,
-            learning_rate=options.learning_rate,
+            **arguments(options, fit_planning),
         )
     document = _open_loop_document(settings, model, params, dataset)
     scores = np.asarray(loss.validate(params, held_out)[2])
