@@ -78,7 +78,7 @@ def with_offset(model: Model) -> Model:
         # Everything else sees the model's own parameters or fiber.
         return function and (lambda offset, *rest: function(offset.params, *rest))
 
-    structure = model.structure
+    structure, on_road = model.structure, model.on_road
     return model._replace(
         # A scalar 0 broadcasts over any control, whose size is not known here.
         init=lambda key: Offset(model.init(key), jnp.zeros(()), None),
@@ -95,6 +95,8 @@ def with_offset(model: Model) -> Model:
         observe=inner(model.observe),
         # Folding is for the parameters inside, see `Offset.params`.
         shared=None,
+        on_road=on_road
+        and (lambda at, road: at._replace(params=on_road(at.params, road))),
         structure=Structure(inner(structure.explicit), inner(structure.rate)),
     )
 

@@ -199,6 +199,8 @@ class Model(NamedTuple):
         vector: latent -> z, the coordinates in which contraction is claimed, (rank,).
         shared: params -> the part of every fiber that does not depend on e, computed
             once before driving; None if there is no such part.
+        on_road: (fiber, (κ, v_ref)) -> the fiber of steps on that road, which all
+            samples of a planner share; None if it is the same.
         fitting: how the parameters are fitted.
         structure: what is known by construction.
         along_path: whether states and controls are those of `geometry`.
@@ -215,6 +217,7 @@ class Model(NamedTuple):
     observe: Callable[[Fiber, Latent, State], Latent]
     vector: Callable[[Latent], Float[Array, " rank"]]
     shared: Callable[[Params], Any] | None = None
+    on_road: Callable[[Fiber, Control], Fiber] | None = None
     fitting: Fitting = Fitting()
     structure: Structure = Structure()
     along_path: bool = False

@@ -25,7 +25,7 @@ from helpers import (
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
 from sfkd_jax.models.sfkd import RESIDUALS
-from sfkd_jax.rollout import Given, fold, rollout
+from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE, Structure, Trajectory
 
 EVERY = (*VARIANTS, *OTHERS, *PHYSICS)
@@ -216,10 +216,9 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
     def driven(params):
         planning = both.planning
         fiber = planning.fiber(params, run.envs[0])
-        first, road = jnp.split(run.controls[0], 2)
-        given = Given(fiber, planning.given(fiber, road))
+        there = planning.on_road(fiber, run.controls[0, 2:])
         latent = planning.encode(fiber, run.states[0])
-        split = planning.vector(planning.step(given, latent, first))
+        split = planning.vector(planning.step(there, latent, run.controls[0]))
         whole = planning.vector(planning.step(fiber, latent, run.controls[0]))
         certified = chain(both, params, run), both.structure.explicit(params)
         return certified, chain(planning, params, run), split, whole

@@ -14,9 +14,10 @@ from sfkd_jax.models import sfkd
 from sfkd_jax.training import (
     Checkpoints,
     TrainingStopped,
+    descend,
     fit,
-    fit_planning,
     multi_step_loss,
+    planning_loss,
 )
 from sfkd_jax.types import Trajectory
 
@@ -144,11 +145,10 @@ def test_what_planners_add_is_what_the_model_lacks():
     envs = draw.uniform([0.3, -8.0], [0.9, 8.0], (16, 8, 2))
     states[:, 1:, 3] += 0.1 * envs[..., 1]
     data = jax.tree.map(jnp.asarray, Trajectory(states, controls, envs))
-    draw, key, space = partial(DRAW, length=1), jax.random.key(1), path_space()
-    fitted = fit_planning(model, params, space, draw, data, key, steps=100)
-    assert same({**fitted, "planning": params["planning"]}, params)
-    loss = multi_step_loss(model.planning, space).validate
-    before, after = (loss(p, data)[1]["one_step"] for p in (params, fitted))
+    loss, start = planning_loss(model, params, path_space()), params["planning"]
+    one = partial(DRAW, length=1), data, jax.random.key(1)
+    fitted = descend(start, loss, *one, steps=100)
+    before, after = (loss.validate(weights, data)[0] for weights in (start, fitted))
     assert after < 0.5 * before
 
 

@@ -31,7 +31,7 @@ from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.ranges import imported
 from sfkd_jax.rollout import fold
 from sfkd_jax.settings import arguments, choose
-from sfkd_jax.training import fit, fit_planning, multi_step_loss
+from sfkd_jax.training import descend, fit, multi_step_loss, planning_loss
 from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("uniform", "wet")
@@ -165,15 +165,15 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         )
     if model.planning is not None:
         store.print_message("training what planners add to its steps")
-        params = fit_planning(
-            model,
-            params,
-            space,
+        added = descend(
+            params["planning"],
+            planning_loss(model, params, space),
             partial(random_windows, batch=options.batch * options.window, length=1),
             dataset.train,
             jax.random.fold_in(key, 1),
-            **arguments(options, fit_planning),
+            **arguments(options, descend),
         )
+        params = {**params, "planning": added}
     document = _open_loop_document(settings, model, params, dataset)
     scores = np.asarray(loss.validate(params, held_out)[2])
     if dataset.scenarios is not None:

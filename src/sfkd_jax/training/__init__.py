@@ -7,4 +7,4 @@ from sfkd_jax.training._loop import fit as fit
 from sfkd_jax.training._losses import Loss as Loss
 from sfkd_jax.training._losses import multi_step_loss as multi_step_loss
 from sfkd_jax.training._losses import one_step_loss as one_step_loss
-from sfkd_jax.training._planning import fit_planning as fit_planning
+from sfkd_jax.training._losses import planning_loss as planning_loss

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
-from sfkd_jax.rollout import defects, rollout, state_errors
+from sfkd_jax.rollout import Folded, defects, fold, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
 
 Parts: TypeAlias = dict[str, Scalar]
@@ -162,6 +162,30 @@ def one_step_loss(model: Model) -> Loss:
         # In the frame of the car, as the scale is.
         gap = state_errors(after, data.states[1:])
         return jnp.mean((gap / jax.lax.stop_gradient(params["scale"])) ** 2)
+
+    return _mean_of(error)
+
+
+def planning_loss(model: Model, params: Params, space: Space) -> Loss:
+    """Return the mean square error of single steps of `model.planning` [mm²].
+
+    Its weights alone are varied. Along a path z is the state, so that a rollout is
+    right where its steps are.
+    """
+    # Folded, since what is certified is frozen.
+    units, frozen = error_units(model, space) / 0.001, fold(model, params)
+    planning = model.planning or model
+
+    def error(weights: Params, data: Trajectory) -> Scalar:
+        own = Folded({**params, "planning": weights}, frozen.shared)
+        after = rollout(planning, own, data)[0]
+        return jnp.mean((state_errors(after, data.states[1:]) * units) ** 2)
+
+    return _mean_of(error)
+
+
+def _mean_of(error: Callable[[Params, Trajectory], Scalar]) -> Loss:
+    """The loss that is the mean of an error over the windows of a batch."""
 
     def evaluate(params: Params, batch: Trajectory) -> Evaluated:
         errors = jax.vmap(error, in_axes=(None, 0))(params, batch)

@@ -7,6 +7,7 @@ is a `Preview`. `along_reference` turns it into one that sees poses in the world
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -154,10 +155,11 @@ class AlongSample(NamedTuple):
 
 
 class AlongTarget(NamedTuple):
-    """The road of one step, κ [1/m] and v_ref [m/s], and the steady turn of the law."""
+    """What all samples share of one step."""
 
-    road: Float[Array, "*horizon 2"]
-    turn: SteadyTurn
+    road: Float[Array, "*horizon 2"]  # κ [1/m] and v_ref [m/s]
+    turn: SteadyTurn  # of the law
+    fiber: Any  # of the model on this road; None: that of all steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +207,9 @@ class FollowingLaw(LawTask):
         before = jnp.where(previous.known, previous.control, law_control)
         latent = self.model.encode(fiber, path_state(coordinates))
         start = AlongSample(latent, coordinates, before)
-        return RolloutSetup(fiber, start, AlongTarget(preview.road, turns))
+        on_road = self.model.on_road
+        fibers = on_road and jax.vmap(partial(on_road, fiber))(preview.road)
+        return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
 
     def step(
         self,
@@ -224,7 +228,8 @@ class FollowingLaw(LawTask):
         # What the limits left of ν: the model was learned on what really acted.
         effective = control - law_control
         inputs = jnp.concatenate([effective, target.road])
-        latent = self.model.step(fiber, before.latent, inputs)
+        here = fiber if target.fiber is None else target.fiber
+        latent = self.model.step(here, before.latent, inputs)
         coordinates = self.model.decode(fiber, latent)[BODY]
         errors, errors_before = (
             PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)

@@ -297,23 +297,22 @@ class PlanningModel(LatentModel):
         return super().fiber(params, env)._replace(planning=known)
 
     def step(
-        self, fiber: SfkdFiber | Given, latent: PosedLatent, control: Control
+        self, fiber: SfkdFiber, latent: PosedLatent, control: Control
     ) -> PosedLatent:
         """Advance z by one sampling period."""
-        if not isinstance(fiber, Given):
-            return super().step(self.on(fiber, control[FREE:]), latent, control)
-        (A, outer), known = fiber.known
-        local = fiber.fiber.local
-        local = local._replace(gains=(local.gains[0], outer))
-        certified = fiber.fiber._replace(A=A, local=local)
-        return super().step(Given(certified, known), latent, control)
+        if fiber.planning is not None:
+            fiber = self.on_road(fiber, control[FREE:])
+        return super().step(fiber, latent, control)
 
-    def given(self, fiber: SfkdFiber, known: Control) -> Any:
-        """Return what κ and v_ref come to: the weights that change, and offsets."""
-        on = self.on(fiber, known)
-        return (on.A, on.local.gains[1]), super().given(on, known)
+    def model(self) -> Model:
+        """Return the functions of F + g, of which nothing is known."""
+        return (
+            super()
+            .model()
+            ._replace(on_road=self.on_road, fitting=Fitting(), structure=Structure())
+        )
 
-    def on(self, fiber: SfkdFiber, road: Control) -> SfkdFiber:
+    def on_road(self, fiber: SfkdFiber, road: Control) -> SfkdFiber:
         """Return the fiber of F that steps like F + g where κ and v_ref are these."""
         weights, env = fiber.planning
         mean, scale = self.space.control_mean, self.space.control_scale
@@ -334,7 +333,7 @@ class PlanningModel(LatentModel):
         local = local._replace(
             gains=gains, offsets=(before, offset + jnp.pad(m, below))
         )
-        return fiber._replace(A=A, local=local)
+        return fiber._replace(A=A, local=local, planning=None)
 
 
 def sfkd(
@@ -455,13 +454,8 @@ def sfkd(
         out, zeros = rank * (rank + FREE + 1), nn.initializers.zeros
         correction = nn.Sequential([*layers, nn.Dense(out, kernel_init=zeros)])
     fields = space, learned, encoder, environment, correction, soft_penalty, beta
-    model = LatentModel(*fields).model()
-    if not planning_residual:
-        return model
-    planner = PlanningModel(*fields).model()
-    # Nothing is known of it.
-    planner = planner._replace(fitting=Fitting(), structure=Structure())
-    return model._replace(planning=planner)
+    planning = PlanningModel(*fields).model() if planning_residual else None
+    return LatentModel(*fields).model()._replace(planning=planning)
 
 
 def _moved(
