@@ -50,7 +50,7 @@ ARROWS = {
     "__init__": {"export", "geometry", "policy", "store"},
 }
 ARROWS |= {"experiment": set(ARROWS)}
-ARROWS |= {name: set(ARROWS) for name in COMMANDS | {"__main__"}}
+ARROWS |= {name: set(ARROWS) for name in COMMANDS}
 
 ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
@@ -70,7 +70,7 @@ THIRD_PARTY = {
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},
     "experiment": COMMAND_LINE | {"threadpoolctl"},
-} | {command: COMMAND_LINE for command in COMMANDS | {"__main__"}}
+} | {command: COMMAND_LINE for command in COMMANDS}
 HEAVY = {
     *("hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib"),
     *("optax", "pandas", "scipy", "pyarrow", "pint"),
@@ -100,7 +100,7 @@ PACKAGE_OF = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
 LIBRARY = [
     name
     for name in FILES
-    if PACKAGE_OF[name] not in COMMANDS | {"__main__", "experiment"}
+    if PACKAGE_OF[name] not in COMMANDS | {"experiment"}
     and not name.endswith("__main__.py")
 ]
 """Files below the commands."""

@@ -1,4 +1,4 @@
-"""The command line: the program sfkd, errors of one line, sweeps."""
+"""The command line: errors of one line, sweeps."""
 
 import json
 import subprocess
@@ -8,11 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sfkd_jax import __main__ as program
-from sfkd_jax import __version__
 from sfkd_jax.experiment.command import hydra_command
 
-ROOT = Path(__file__).parents[2]
 SCRIPT = """
     import os
     from sfkd_jax.certification import CertificateStale, CertificationRefused
@@ -55,25 +52,6 @@ def toy(tmp_path):
 def printed(done):
     lines = done.stdout.splitlines()
     return [json.loads(line) for line in lines if line.startswith("{")]
-
-
-def test_without_a_command_every_command_of_the_package_is_listed(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["sfkd"])
-    program.main()
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"sfkd_jax {__version__}")
-    for name in program.COMMANDS:
-        (line,) = [line for line in lines if line.split()[:1] == [name]]
-        assert line.endswith(".")
-    files = (ROOT / "src" / "sfkd_jax").glob("*.py")
-    commands = {file.stem for file in files if "hydra_command(run)" in file.read_text()}
-    assert commands <= {*program.COMMANDS, "__main__"}
-
-
-def test_an_unknown_command_is_one_line(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["sfkd", "trian"])
-    with pytest.raises(SystemExit, match=r"unknown command trian; did you mean train?"):
-        program.main()
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def run_columns(trained: Any) -> Columns:
 
 @contextmanager
 def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
-    """Write a run as it is driven, for `sfkd collect`: a row at every call.
+    """Write a run as it is driven, for `collect`: a row at every call.
 
         with recorder(policy, "recorded/1.csv") as record:
             control, state, info = policy.controller.act(...)
