@@ -19,8 +19,9 @@ from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
-TOGETHER = 400
-"""Largest number of samples that are rolled out at once."""
+TOGETHER = 16_384
+"""Largest number of samples that are rolled out at once, for the memory: smaller ones
+leave cores less to share."""
 C = TypeVar("C")
 Memory = TypeVar("Memory")
 
@@ -258,7 +259,7 @@ class Planner(Stateful):
         return control, after, info
 
     def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
-        """Roll out all plans, some hundred at a time."""
+        """Roll out all plans, as many at a time as the memory holds."""
         task, numbers = self.task, jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
 
@@ -274,7 +275,7 @@ class Planner(Stateful):
         def one(plan: Plan) -> Any:
             return jax.lax.scan(body, setup.start, (plan, setup.targets, places))[1]
 
-        # Batches of one size, that a core keeps in its cache.
+        # Batches of one size.
         size = -(-plans.shape[1] // -(-plans.shape[1] // TOGETHER))
         along, worst = jax.tree.map(
             lambda leaf: jnp.swapaxes(leaf, 0, 1),
