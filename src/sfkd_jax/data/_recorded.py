@@ -67,7 +67,7 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
             if "perturbation" not in info:
                 raise ValueError("only a policy with a shield has runs to collect")
             if not info["env_inside"]:
-                warnings.warn(f"e is outside its box: {box}. The unit?", stacklevel=2)
+                warnings.warn(f"e left {box}: no corridor. The unit?", stacklevel=2)
             time = dt * next(rows) if time is None else time
             row = [time, *observation, *info["path_state"][:2], *control, *env[:size]]
             row += [*info["perturbation"], *info["road"]]

@@ -140,7 +140,7 @@ class ExportedController:
             told = ", ".join(
                 f"{name} {low:.3g} … {high:.3g}" for name, low, high in box
             )
-            warnings.warn(f"e is outside its box: {told}. The unit?", stacklevel=2)
+            warnings.warn(f"e left {told}: no corridor. The unit?", stacklevel=2)
         if origin.any():
             for name in {"predicted_states", "reference"} & set(info):
                 moved: Any = _shifted(info[name], origin)

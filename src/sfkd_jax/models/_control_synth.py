@@ -62,6 +62,7 @@ def control_synth(
     rate: Positive = 0.05,
     input_hidden: tuple[int, ...] = (96, 96),
     environment: bool = True,
+    frame: str = "body",
 ) -> Model:
     """Networks of the state beside a network of the input, contracting at a hard rate.
 
@@ -90,6 +91,7 @@ def control_synth(
         width: of each network.
         rate: γ [1/s].
         input_hidden: widths of the network that holds g and h.
+        frame: "body", or "path" for path coordinates.
 
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """
@@ -137,7 +139,7 @@ def control_synth(
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
 
     learned = Rates(init, rates, fiber)
-    return continuous(space, learned, dt=dt, environment=environment)
+    return continuous(space, learned, dt=dt, environment=environment, frame=frame)
 
 
 def contracting(free: Params, rate: float) -> Synthesis:

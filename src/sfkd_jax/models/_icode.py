@@ -77,6 +77,7 @@ def icode(
     layers: int = 3,
     environment: bool = True,
     affine_in: str = "both",
+    frame: str = "body",
 ) -> Model:
     """Input concomitant neural ODE: rates affine in control and environment.
 
@@ -92,6 +93,7 @@ def icode(
         layers: number of hidden layers of f and of G.
         affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, where e is what the
             paper calls an extrinsic input; "control" for f(s, e) + G(s, e) u.
+        frame: "body", or "path" for path coordinates.
 
     Source: Li et al., arXiv 2411.13914.
     """
@@ -104,7 +106,9 @@ def icode(
     def euler(rate: Callable[[State], State], state: State, dt: float) -> State:
         return state + dt * rate(state)
 
-    return continuous(space, rates, dt=dt, environment=environment, solve=euler)
+    return continuous(
+        space, rates, dt=dt, environment=environment, solve=euler, frame=frame
+    )
 
 
 def icode_mppi(
