@@ -213,7 +213,7 @@ def build_controller(
         **arguments(settings.cost, control.tracking_cost),
     )
     own = {**box, **arguments(settings.own, factory)}
-    # Here and nowhere else: all around the planner has the model that is certified.
+    # Here and nowhere else: what guards the planner has the model that is certified.
     rolled = model.planning or model
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
@@ -235,7 +235,7 @@ def build_controller(
         raise ValueError(
             "a model in path coordinates needs controller.sampling=law and its law"
         )
-    # The planner sees the offset; the estimator needs the model as it was learned.
+    # The planner sees the offset; the estimator needs the model without it.
     planned, guarded = (with_offset(m) if adaptive else m for m in (rolled, model))
     task = control.following_law(
         planned,
@@ -253,7 +253,7 @@ def build_controller(
         # The filter relates forces to the largest one in E, which the box defines.
         if None in box.values():
             raise ValueError("adaptation needs environment.low and environment.high")
-        around: Any = {"inner": along, "model": model, "law": law, **limits, **box}
+        around: Any = {"inner": along, "model": rolled, "law": law, **limits, **box}
         options = arguments(searches.adaptation, control.Adaptation)
         adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
         along = adaptation.controller()
