@@ -214,7 +214,7 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
 
     @jit
     def driven(params):
-        planning = both.planning
+        params, planning = fold(both, params), both.planning
         fiber = planning.fiber(params, run.envs[0])
         there = planning.on_road(fiber, run.controls[0, 2:])
         latent = planning.encode(fiber, run.states[0])
@@ -223,7 +223,12 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
         certified = chain(both, params, run), both.structure.explicit(params)
         return certified, chain(planning, params, run), split, whole
 
-    alone = jit(lambda p: (chain(model, p, run), model.structure.explicit(p)))(params)
+    @jit
+    def as_certified(params):
+        params = fold(model, params)
+        return chain(model, params, run), model.structure.explicit(params)
+
+    alone = as_certified(params)
     for size in (0.0, 0.1, 1e30, np.nan):
         more = jax.tree.map(lambda leaf, size=size: leaf + size, params["planning"])
         certified, planned, split, whole = driven({**params, "planning": more})

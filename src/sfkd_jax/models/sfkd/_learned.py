@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sfkd_jax.models._networks import SMALL, Free, Sandwich, Weights, bounded
 from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
@@ -184,11 +184,43 @@ class Learned(nn.Module):
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
         """Return the functions of e; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
+        tables = self._tables(lambda head: head(embedding))
+        mixture = None if self.scheduled else nn.softmax(self.mixture_head(embedding))
+        return PerEnvironment(
+            # On the simplex by construction: a mixture of contractions contracts.
+            mixture=mixture,
+            gains=tuple(table[:, :-1] for table in tables),
+            offsets=tuple(table[:, -1] for table in tables),
+            # Evaluated in any case, so that the ablation has the same parameters.
+            tangents=self.tangent_head(embedding),
+            embedding=embedding,
+        )
+
+    def bilinear(self) -> tuple[Float[Array, "row product"], ...]:
+        """Return T of gain(e) u + offset(e) = T ([ψ(e); 1] ⊗ [u; 1]), of both tables.
+
+        For training, where every step of every window has its own e: gains of each of
+        them would be a hundred times as many numbers as a product of ψ and u.
+        """
+
+        def tables(column: Int[Array, ""]) -> tuple[Array, ...]:
+            def weights(head: nn.Dense) -> Array:
+                own = head.variables["params"]
+                return jnp.vstack([own["kernel"], own["bias"]])[column]
+
+            return self._tables(weights)
+
+        # The tables are linear in the outputs of the heads, hence in their weights.
+        parts = jax.vmap(tables, out_axes=1)(jnp.arange(self.embedding + 1))
+        return tuple(part.reshape(part.shape[0], -1) for part in parts)
+
+    def _tables(self, read: Callable[[nn.Dense], Array]) -> tuple[Array, ...]:
+        """Return [gain, offset] of the biases before a tanh, and of the others."""
 
         def table(head: nn.Dense) -> Array:
-            return head(embedding).reshape(-1, self.control + 1)
+            return read(head).reshape(-1, self.control + 1)
 
-        B = self.input_head(embedding).reshape(self.rank, self.control)
+        B = read(self.input_head).reshape(self.rank, self.control)
         outer = [jnp.pad(B, ((0, 0), (0, 1)))]
         hidden = [outer[0][:0]]
         if self.kind is not None:
@@ -201,19 +233,9 @@ class Learned(nn.Module):
             outer.append(rows[-3:])
         if self.forcing_hidden:
             hidden.append(table(self.forcing_head))
-        mixture = None if self.scheduled else nn.softmax(self.mixture_head(embedding))
         if self.scheduled:
             outer.append(table(self.mixture_head))
-        tables = jnp.concatenate(hidden), jnp.concatenate(outer)
-        return PerEnvironment(
-            # On the simplex by construction: a mixture of contractions contracts.
-            mixture=mixture,
-            gains=tuple(table[:, :-1] for table in tables),
-            offsets=tuple(table[:, -1] for table in tables),
-            # Evaluated in any case, so that the ablation has the same parameters.
-            tangents=self.tangent_head(embedding),
-            embedding=embedding,
-        )
+        return jnp.concatenate(hidden), jnp.concatenate(outer)
 
 
 def _couplings(

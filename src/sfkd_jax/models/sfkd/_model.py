@@ -88,6 +88,8 @@ class SfkdFiber(NamedTuple):
     centre: Float[Array, " body"]
     # Weights of φ, or C⁻¹ where z is the state.
     encoder: Any
+    # Both tables of biases as forms of ψ and u, for training; else None.
+    bilinear: tuple[Float[Array, "_ _"], ...] | None = None
     planning: Any = None  # weights of g and the e that it reads, see `PlanningModel`
 
 
@@ -154,7 +156,8 @@ class LatentModel:
         offsets = _moved(gains, local.offsets, -self.space.control_mean)
         local = local._replace(gains=gains, offsets=offsets)
         operator = Mixture(local.mixture, shared.vertices)
-        if local.mixture is not None and isinstance(params, Folded):
+        folded = isinstance(params, Folded)
+        if local.mixture is not None and folded:
             operator = operator.summed()
         return SfkdFiber(
             A=operator,
@@ -165,6 +168,7 @@ class LatentModel:
             readout=shared.readout,
             centre=shared.centre,
             encoder=unfold(params)["encoder"] if self.encoder else shared.lift,
+            bilinear=None if folded else self._apply(params, "bilinear"),
         )
 
     def encode(self, fiber: SfkdFiber, state: State) -> PosedLatent:
@@ -200,7 +204,12 @@ class LatentModel:
         The residual's last bias includes B(e) u + f(u, e). No Lipschitz bound in z sees
         a bias.
         """
-        hidden, outer = _moved(fiber.local.gains, fiber.local.offsets, control)
+        if fiber.bilinear is None:
+            hidden, outer = _moved(fiber.local.gains, fiber.local.offsets, control)
+        else:
+            scaled = jnp.append(self.space.scaled_control(control), 1.0)
+            read = jnp.outer(jnp.append(fiber.local.embedding, 1.0), scaled).ravel()
+            hidden, outer = (table @ read for table in fiber.bilinear)
         layers = *fiber.residual[:-1], *fiber.decoder[:-1]
         edges = accumulate(layer.shape[0] for layer in layers)
         *biases, forcing = jnp.split(hidden, list(edges))
@@ -294,7 +303,8 @@ class PlanningModel(LatentModel):
         """Return the fiber of F, with what g reads."""
         reads = self.space.scaled_env(env, self.environment)
         known = unfold(params)["planning"], reads
-        return super().fiber(params, env)._replace(planning=known)
+        # `on_road` adds to gains and offsets.
+        return super().fiber(params, env)._replace(planning=known, bilinear=None)
 
     def step(
         self, fiber: SfkdFiber, latent: PosedLatent, control: Control
