@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial, wraps
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, behind, law_from_arrays, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.rollout import fold, unfold
+from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Model, Params
 
@@ -280,7 +280,7 @@ def restore(path: str | Path) -> TrainedModel:
         vehicle, model = _build(json.dumps(parts))
         # Settings of a wrong type fail only here. Weights are float32 in any process.
         with jax.enable_x64(False):
-            shapes = jax.eval_shape(model.init, jax.random.key(0))
+            shapes = jax.eval_shape(lambda: model.init(jax.random.key(0)))
         for name, leaf in arrays.items():
             if not np.all(np.isfinite(leaf)):
                 raise store.ArtefactError(f"{file}: weights {name} are not finite")
@@ -327,6 +327,12 @@ def load(
             is asked of a policy that is not in path coordinates.
     """
     trained, file = restore(path), _file(path)
+    # Here, so that a certificate is checked on the weights that will be multiplied.
+    with on_host():
+        folded = jax.jit(fold, static_argnums=0)(
+            trained.model, jax.tree.map(np.asarray, trained.params)
+        )
+    trained = replace(trained, params=jax.device_put(jax.tree.map(np.asarray, folded)))
     certificate, reason = read_certificate(path, trained)
     with store.as_artefact_error(file):
         reads = trained.settings["model"].get("environment", True)
@@ -367,9 +373,8 @@ def load(
     if certificate is None:
         # 3: `_numerics` stands between this function and its caller.
         warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
-    params = jax.jit(fold, static_argnums=0)(trained.model, trained.params)
     return Policy(
-        **vars(trained) | {"params": params, "settings": settings},
+        **vars(replace(trained, settings=settings)),
         controller=_entrance(planner, trained),
         certificate=certificate,
         around=around,
@@ -383,6 +388,8 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
     """
     names = trained.vehicle.state_names
     shape, env_shape = (len(names),), (len(trained.settings["space"]["env_mean"]),)
+    # One program, where every array of the state would otherwise be one.
+    compiled = jax.jit(controller.init)
 
     @wraps(controller.init)
     def init(key: Key) -> Any:
@@ -391,7 +398,7 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
                 "jax_debug_nans: controllers along a path keep NaN for what is not "
                 "known yet; switch it off"
             )
-        return controller.init(key)
+        return compiled(key)
 
     @wraps(controller.act)
     def act(
@@ -480,8 +487,9 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Param
         raise store.ArtefactError(
             f"{file}: weights {name} are {found}, the model has {wanted}"
         )
-    # In the order of the tree, whatever that of the file is.
-    leaves = [jnp.asarray(arrays[name]) for name in needed]
+    # In the order of the tree, whatever that of the file is. `jnp.asarray` compiles
+    # a program for each shape.
+    leaves = jax.device_put([arrays[name] for name in needed])
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -40,6 +41,21 @@ def fold(model: Model, params: Params) -> Params:
     if model.shared is None or isinstance(params, Folded):
         return params
     return Folded(params, model.shared(params))
+
+
+@contextmanager
+def on_host() -> Iterator[None]:
+    """Evaluate on the host, or else in full precision.
+
+    Accelerators round float32 factors to ten bits, which the witnesses of another
+    machine do not survive.
+    """
+    try:
+        host = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS names accelerators only
+        host = None
+    with jax.default_device(host), jax.default_matmul_precision("float32"):
+        yield
 
 
 def unfold(params: Params) -> Params:

@@ -15,7 +15,7 @@ import pytest
 from helpers import put, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import demo, policy, store
+from sfkd_jax import demo, policy, rollout, store
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -350,7 +350,8 @@ def test_explicit_weights_ask_for_full_products(monkeypatch, full, holds):
         def default_matmul_precision(self, name):
             return jax.default_matmul_precision(name if full else "bfloat16")
 
-    monkeypatch.setattr(_weights, "jax", Device())
+    for module in (_weights, rollout):
+        monkeypatch.setattr(module, "jax", Device())
     if holds:
         check(honest("kinematic_path"), "kinematic_path")
         return

@@ -13,7 +13,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
+import numpy as np
 
 from sfkd_jax import control, models, plants, scenarios, store
 from sfkd_jax.build._controllers import CONTROLLER_SETTINGS as CONTROLLER_SETTINGS
@@ -278,7 +279,7 @@ def _check_law(
     side, (slow, fast) = asked["lateral_acceleration"], asked["speed"]
     ends = {"low": (-side, slow, *box["low"]), "high": (side, fast, *box["high"])}
     for name, wanted in {**ends, "perturbation": asked["perturbation"]}.items():
-        if not jnp.allclose(law[name], jnp.asarray(wanted), rtol=1e-6, atol=0.0):
+        if not np.allclose(law[name], wanted, rtol=1e-6, atol=0.0):
             raise ValueError(f"its law has {name} {law[name]}, its settings {wanted}")
     # The second control of a vehicle of one's own may be anything.
     if settings["vehicle"]["name"] in _KINDS or vehicle.speed_loop:
@@ -295,8 +296,8 @@ def _check_law(
 def space_from_settings(settings: Values) -> Space:
     """Return the scales that a manifest holds."""
     # JSON has decimals: as float32 they are the bits that the model was trained with.
-    arrays = (jnp.asarray(settings[name], dtype="float32") for name in Space._fields)
-    return Space(*arrays)
+    arrays = [np.asarray(settings[name], dtype="float32") for name in Space._fields]
+    return Space(*jax.device_put(arrays))
 
 
 def build_driver(plant: plants.Vehicle) -> Driver:

@@ -329,7 +329,8 @@ def in_corridor(
     corridor = corridor_of(certificate)
     bounds, sensors = corridor["bounds"], _sensors(corridor)
     # What the heading's noise moves the car sideways until the law has turned it back.
-    ratio = float(np.max(law.gain[..., 0, HEADING] / law.gain[..., 0, LATERAL]))
+    steering = np.asarray(law.gain)[..., 0, :]
+    ratio = float(np.max(steering[..., HEADING] / steering[..., LATERAL]))
     return control.Shield(
         inner=planner,
         model=model,
@@ -370,10 +371,10 @@ def _rear(law: control.PathLaw) -> float:
     # The gentlest turn of the table that is one.
     row = min(last // 2 + 1, last)
     gentle = np.asarray(law.state)[row, ..., HEADING]
-    sideways = float(law.high[0]) * (2.0 * row / last - 1.0)
-    slow, fast = float(law.low[1]), float(law.high[1])
+    (_, slow, *_), (side, fast, *_) = (np.asarray(end, float) for end in law[:2])
+    sideways = side * (2.0 * row / last - 1.0)
     bends = sideways / slow**2 - sideways / fast**2
-    return max(float(np.median(gentle[-1] - gentle[0])) / bends, 0.0)
+    return max(float(np.median(gentle[-1] - gentle[0]) / bends), 0.0)
 
 
 def _test(certificate: Mapping[str, Any] | None) -> control.InnovationTest | None:

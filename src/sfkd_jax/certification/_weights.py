@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 
-from sfkd_jax.rollout import unfold
+from sfkd_jax.rollout import on_host, unfold
 from sfkd_jax.types import Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
@@ -68,19 +68,16 @@ def well_formed() -> Iterator[None]:
 
 
 def exported(model: Model, params: Params) -> Exported:
-    """Return the explicit weights in float64; refuse those that nothing is known of."""
+    """Return the explicit weights in float64; refuse those that nothing is known of.
+
+    Of folded parameters they are those that a controller multiplies.
+    """
     explicit = model.structure.explicit
     if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
     evaluate = jax.jit(explicit, compiler_options=COMPILER_OPTIONS)
-    try:
-        host = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:  # JAX_PLATFORMS names accelerators only
-        host = None
-    # Accelerators round float32 factors to ten bits, which the witnesses of another
-    # machine do not survive: evaluated on the host, or else in full precision.
-    with jax.default_device(host), jax.default_matmul_precision("float32"):
-        weights = evaluate(jax.tree.map(np.asarray, unfold(params)))
+    with on_host():
+        weights = evaluate(jax.tree.map(np.asarray, params))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))

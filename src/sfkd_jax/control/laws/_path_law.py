@@ -139,7 +139,7 @@ def _corners(
 
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:
     """Return the law from a dictionary of arrays, such as `law._asdict()`."""
-    return PathLaw(**{name: jnp.asarray(arrays[name]) for name in PathLaw._fields})
+    return PathLaw(*jax.device_put([arrays[name] for name in PathLaw._fields]))
 
 
 def textbook_law(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
@@ -95,8 +96,8 @@ class InnovationTest(NamedTuple):
 
 def innovation_test(document: Mapping[str, Any]) -> InnovationTest:
     """Return the test from its entry of a certificate."""
-    entries = (document[name] for name in InnovationTest._fields)
-    return InnovationTest(*(jnp.asarray(entry, float) for entry in entries))
+    entries = [np.asarray(document[name], float) for name in InnovationTest._fields]
+    return InnovationTest(*jax.device_put(entries))
 
 
 def expected_coordinates(
