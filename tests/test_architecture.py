@@ -104,7 +104,7 @@ LIBRARY = [
     and not name.endswith("__main__.py")
 ]
 """Files below the commands."""
-COMPILES = {"policy", "training", "certification", "export", "data"}
+COMPILES = {"rollout", "policy", "training", "certification", "export", "data"}
 """Packages that run on the host, and may call `jax.jit`; so may gymnasium's adapter."""
 
 

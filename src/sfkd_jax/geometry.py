@@ -42,6 +42,14 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
+def put(vector: Float[Array, " n"], index: int, value: Scalar) -> Float[Array, " n"]:
+    """Return the vector with another entry.
+
+    A choice, not a scatter: XLA then evaluates it along with what is around it.
+    """
+    return jnp.where(np.arange(vector.shape[0]) == index, value, vector)
+
+
 def compose(
     pose: Float[Array, " 3"], increment: Float[Array, " 3"]
 ) -> Float[Array, " 3"]:
@@ -190,7 +198,8 @@ def followable(reference: Reference) -> tuple[Reference, Bool[Array, ""]]:
     # The first point has none before it, and moves as the next one does.
     still = jnp.concatenate([still[:1], still]) & (reference[:, 3] > SLOWEST)
     wrong = still | (reference[:, 3] < 0.0)
-    return reference.at[:, 3].set(jnp.where(wrong, 0.0, reference[:, 3])), ~wrong.any()
+    speed = jnp.where(wrong, 0.0, reference[:, 3])
+    return jnp.concatenate([reference[:, :3], speed[:, None]], 1), ~wrong.any()
 
 
 def curvature_between(reference: Reference) -> Float[Array, " gap"]:

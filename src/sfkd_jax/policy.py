@@ -19,7 +19,7 @@ from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, behind, law_from_arrays, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.rollout import fold, on_host, unfold
+from sfkd_jax.rollout import folded, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Model, Params
 
@@ -280,7 +280,7 @@ def restore(path: str | Path) -> TrainedModel:
         vehicle, model = _build(json.dumps(parts))
         # Settings of a wrong type fail only here. Weights are float32 in any process.
         with jax.enable_x64(False):
-            shapes = jax.eval_shape(lambda: model.init(jax.random.key(0)))
+            shapes = jax.eval_shape(model.init, jax.eval_shape(jax.random.key, 0))
         for name, leaf in arrays.items():
             if not np.all(np.isfinite(leaf)):
                 raise store.ArtefactError(f"{file}: weights {name} are not finite")
@@ -328,11 +328,7 @@ def load(
     """
     trained, file = restore(path), _file(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
-    with on_host():
-        folded = jax.jit(fold, static_argnums=0)(
-            trained.model, jax.tree.map(np.asarray, trained.params)
-        )
-    trained = replace(trained, params=jax.device_put(jax.tree.map(np.asarray, folded)))
+    trained = replace(trained, params=folded(trained.model, trained.params))
     certificate, reason = read_certificate(path, trained)
     with store.as_artefact_error(file):
         reads = trained.settings["model"].get("environment", True)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import rotate, wrap_angle
@@ -35,7 +35,7 @@ def fold(model: Model, params: Params) -> Params:
     """Evaluate once what every control step would otherwise evaluate again.
 
     `policy.load` does this; a program that controls with parameters it has just trained
-    calls it, and compiles it.
+    calls `folded`.
     """
     # Folding twice would wrap the weights twice, and `unfold` removes one layer.
     if model.shared is None or isinstance(params, Folded):
@@ -43,9 +43,15 @@ def fold(model: Model, params: Params) -> Params:
     return Folded(params, model.shared(params))
 
 
-@contextmanager
-def on_host() -> Iterator[None]:
-    """Evaluate on the host, or else in full precision.
+def folded(model: Model, params: Params) -> Params:
+    """Return `fold` of parameters, by one program for all who need it of a model."""
+    if model.shared is None or isinstance(params, Folded):
+        return params
+    return jax.device_put(on_host(fold, model, params))
+
+
+def on_host(function: Callable[..., Any], model: Model, params: Params) -> Any:
+    """Evaluate a function of parameters on the host, or else in full precision.
 
     Accelerators round float32 factors to ten bits, which the witnesses of another
     machine do not survive.
@@ -55,7 +61,10 @@ def on_host() -> Iterator[None]:
     except RuntimeError:  # JAX_PLATFORMS names accelerators only
         host = None
     with jax.default_device(host), jax.default_matmul_precision("float32"):
-        yield
+        evaluated = jax.jit(function, static_argnums=0)(
+            model, jax.tree.map(np.asarray, params)
+        )
+    return jax.tree.map(np.asarray, evaluated)
 
 
 def unfold(params: Params) -> Params:

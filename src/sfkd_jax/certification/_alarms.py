@@ -22,7 +22,7 @@ from sfkd_jax.control import (
 from sfkd_jax.data import sensor_keys
 from sfkd_jax.geometry import HEADING, LATERAL, PERTURBATION
 from sfkd_jax.plants import Vehicle, along_path
-from sfkd_jax.rollout import fold, rollout
+from sfkd_jax.rollout import folded, rollout
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -69,9 +69,8 @@ def closed_loop(
             "a corridor needs a policy in path coordinates, with its law: "
             "model.frame=path"
         )
-    folded = jax.jit(partial(fold, model))(params)
     closed = along_path(plant, law, perturbation=law.perturbation)
-    return Loop(closed, law, model, folded, tuple(noise))
+    return Loop(closed, law, model, folded(model, params), tuple(noise))
 
 
 def sensor_effect(
@@ -137,7 +136,7 @@ def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:
         control = law(xi, road[0], road[1], env) + inputs[:2]
         turned = loop.plant.dt * turning_rate(law, xi, control, road, env)
         innovation = jnp.append(after - expected, (after - xi)[HEADING] - turned)
-        return innovation, steering_level(law, road, env)
+        return innovation, steering_level(law.turn(road[0], road[1], env))
 
     measured = runs.states[:, :-1, BODY] + spread * noise
     given = measured[:, :-1], measured[:, 1:], runs.controls[:, :-1], runs.envs[:, :-1]

@@ -9,7 +9,6 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any
 
-import jax
 import numpy as np
 
 from sfkd_jax.certification._attack import attack_claims
@@ -44,7 +43,7 @@ from sfkd_jax.certification._weights import (
     well_formed,
 )
 from sfkd_jax.ranges import Fraction, NonNegativeInt
-from sfkd_jax.rollout import fold
+from sfkd_jax.rollout import folded
 from sfkd_jax.types import Model, Params, Trajectory
 
 MARGIN = 1e-4
@@ -248,7 +247,7 @@ def issue(
     except CertificationRefused as reason:
         lyapunov = {"reason": str(reason)}
     # Folded for measurements alone: the proof is about the stored weights.
-    measure = partial(residuals, model, jax.jit(partial(fold, model))(params))
+    measure = partial(residuals, model, folded(model, params))
     reference, scores = measure(validation), measure(calibration)
     unseen = {name: measure(part) for name, part in held_out.items()}
     outputs, largest = {}, None

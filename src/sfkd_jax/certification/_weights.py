@@ -10,14 +10,12 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 
-from sfkd_jax.rollout import on_host, unfold
+from sfkd_jax.rollout import folded, on_host, unfold
 from sfkd_jax.types import Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
 TRANSPORTS = ("identity", "rotation")
-COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""Less optimisation, since full optimisation compiles longer than it saves here."""
 MALFORMED = (
     LookupError,
     TypeError,
@@ -70,14 +68,11 @@ def well_formed() -> Iterator[None]:
 def exported(model: Model, params: Params) -> Exported:
     """Return the explicit weights in float64; refuse those that nothing is known of.
 
-    Of folded parameters they are those that a controller multiplies.
+    They are those of the folded parameters, which a controller multiplies.
     """
-    explicit = model.structure.explicit
-    if explicit is None:
+    if model.structure.explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    evaluate = jax.jit(explicit, compiler_options=COMPILER_OPTIONS)
-    with on_host():
-        weights = evaluate(jax.tree.map(np.asarray, params))
+    weights = on_host(_explicit, model, folded(model, params))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
@@ -98,6 +93,11 @@ def exported(model: Model, params: Params) -> Exported:
         f"the transport {transport!r} is not known to be nonexpansive",
     )
     return weights
+
+
+def _explicit(model: Model, params: Params) -> Any:
+    assert model.structure.explicit is not None
+    return model.structure.explicit(params)
 
 
 def fingerprint(params: Params) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -152,20 +153,19 @@ def gram_bound(
     ≤ ||G_k||_F^(1/2^k), scales undone. It needs no singular vectors, so the gradient is
     finite at repeated singular values. Source: Delattre et al., arXiv 2305.16173.
     """
-    scale = _frobenius(matrix)
-    # Unit norm first: squaring very large or small entries leaves float32.
-    gram = matrix / scale
-    # Scales are kept as logarithms: a norm to the power 2^k leaves float32.
-    log_norm = jnp.log(scale)
-    power = 1.0
-    for _ in range(iterations):
-        gram = gram.T @ gram
-        # A Gram step squares the norm, so each later scale counts half as much.
-        power /= 2.0
+
+    def square(k: Any, known: tuple[Array, Scalar]) -> tuple[Array, Scalar]:
+        gram = known[0].T @ known[0]
         scale = _frobenius(gram)
-        gram = gram / scale
-        log_norm = log_norm + power * jnp.log(scale)
-    return jnp.exp(log_norm)
+        # A Gram step squares the norm, so each later scale counts half as much.
+        return gram / scale, known[1] + 0.5**k * jnp.log(scale)
+
+    scale = _frobenius(matrix)
+    # Unit norm first: squaring very large or small entries leaves float32. Scales are
+    # kept as logarithms: a norm to the power 2^k leaves it as well.
+    first = square(1.0, (matrix / scale, jnp.log(scale)))
+    # A loop: unrolled, most of the time to compile a model is in here.
+    return jnp.exp(jax.lax.fori_loop(2, iterations + 1, square, first)[1])
 
 
 def bounded(

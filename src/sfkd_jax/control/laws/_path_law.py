@@ -10,10 +10,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control.laws._recovery import SteadyTurn
-from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_step
+from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_step, put
 from sfkd_jax.ranges import AtLeastTwo, Positive, Span
 from sfkd_jax.types import Control, Environment, Scalar, Step
 
@@ -77,39 +78,34 @@ class PathLaw(NamedTuple):
         """
         speed, sharpest = jnp.maximum(speed, 0.0), self.high[0]
         counts = self.control.shape[:-1]
-
-        def interpolate(acceleration: Scalar, *tables: Array) -> list[Array]:
-            # Over v² κ: the limit of the tyres is the same at every speed of the table.
-            at = jnp.concatenate([jnp.stack([acceleration, speed]), env])
-            rows, weights = _corners(at, self.low, self.high, counts)
-            corners = (
-                table.reshape(-1, *table.shape[len(counts) :])[rows] for table in tables
-            )
-            return [jnp.tensordot(weights, corner, axes=1) for corner in corners]
-
-        state, control, gain = interpolate(
-            curvature * speed**2, self.state, self.control, self.gain
+        # Over v² κ: the limit of the tyres is the same at every speed of the table.
+        at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
+        rows, weights = _corners(at, self.low, self.high, counts)
+        state, control, gain = (
+            jnp.tensordot(weights, table.reshape(-1, *table.shape[len(at) :])[rows], 1)
+            for table in (self.state, self.control, self.gain)
         )
         # Below the table less drive keeps the speed, and at rest none.
         share = jnp.clip(speed / self.low[1], 0.0, 1.0)
-        control = control.at[1].multiply(share)
-        left, right = (
-            interpolate(side * sharpest, self.control)[0][0] for side in (1.0, -1.0)
-        )
+        control = put(control, 1, control[1] * share)
+        right, left = self._steerings(slice(None, None, counts[0] - 1), at[1:])
         tabled = jnp.clip(speed, self.low[1], self.high[1])
         slope = 0.5 * (left - right) * tabled**2 / sharpest
         grip = jnp.stack([slope, sharpest])
-        return SteadyTurn(state.at[PATH_SPEED].set(speed), control, gain, grip)
+        return SteadyTurn(put(state, PATH_SPEED, speed), control, gain, grip)
 
     def curvature(self, steering: Scalar, speed: Scalar, env: Environment) -> Scalar:
         """Return κ of the steady turn with this steering; NaN beyond the table."""
-        counts, ends = self.control.shape[:-1], (self.low[0], self.high[0])
-        at = jnp.concatenate([speed[None], env])
-        rows, weights = _corners(at, self.low[1:], self.high[1:], counts[1:])
-        steerings = self.control[..., 0].reshape(counts[0], -1)[:, rows] @ weights
+        steerings = self._steerings(slice(None), jnp.concatenate([speed[None], env]))
         beyond = {"left": jnp.nan, "right": jnp.nan}
-        turns = jnp.linspace(*ends, counts[0])
+        turns = jnp.linspace(self.low[0], self.high[0], len(steerings))
         return jnp.interp(steering, steerings, turns, **beyond) / speed**2
+
+    def _steerings(self, turns: slice, at: Array) -> Float[Array, " turn"]:
+        """Return the steering of some of the tabled v² κ, at a speed and e."""
+        counts, table = self.control.shape[1:-1], self.control[turns, ..., 0]
+        rows, weights = _corners(at, self.low[1:], self.high[1:], counts)
+        return table.reshape(len(table), -1)[:, rows] @ weights
 
     def __call__(
         self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
@@ -125,16 +121,16 @@ def _corners(
     counts: tuple[int, ...],
 ) -> tuple[Int[Array, " corner"], Float[Array, " corner"]]:
     """Flat indices and weights of the grid points for multilinear interpolation."""
-    last = jnp.asarray(counts) - 1
+    last = np.asarray(counts) - 1
     # Clipped: outside the axes the turn at their ends, never an extrapolated gain.
     position = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
     # At most the last but one, so that an upper neighbour exists at the end.
     index = jnp.minimum(jnp.floor(position).astype(int), last - 1)
     beyond = position - index
-    sides = jnp.asarray(list(product((0, 1), repeat=len(counts))))
-    strides = jnp.asarray([prod(counts[axis + 1 :]) for axis in range(len(counts))])
+    sides = np.asarray(list(product((0, 1), repeat=len(counts))))
+    strides = np.asarray([prod(counts[axis + 1 :]) for axis in range(len(counts))])
     weights = jnp.prod(jnp.where(sides == 1, beyond, 1.0 - beyond), axis=1)
-    return (index + sides) @ strides, weights
+    return jnp.sum(index * strides) + sides @ strides, weights
 
 
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:

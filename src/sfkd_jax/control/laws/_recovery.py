@@ -84,30 +84,33 @@ class SteadyTurn(NamedTuple):
         A U-turn leads away from the path for longer than a horizon: a planner would
         rather park.
         """
-        _, astray, far = course(self, coordinates - self.state)
+        _, astray, far, _ = course(self, coordinates - self.state)
         return 1.0 - far * astray
 
 
-def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, Scalar, Scalar]:
+def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, ...]:
     """Return how far the vehicle is from the angle ψ* of approach, and from its path.
 
         ψ* = −sign(e_y) min(K_y/K_ψ |e_y|, √(2 |e_y| / R), `STEEPEST`),   R ~ v²/a
 
     Near the path ψ* is that of the linear law; farther away the vehicle can turn in on
     an arc of radius R. Returned are e_ψ − ψ* [rad], a share that is 1 where there is
-    much to turn, and one that is 0 in the box `NEAR` and 1 from twice its size on.
+    much to turn, one that is 0 in the box `NEAR` and 1 from twice its size on, and the
+    curvature that the grip allows [1/m].
     """
     far = jnp.max(jnp.abs(errors[: PATH_SPEED + 1]) / jnp.asarray(NEAR)) - 1.0
     aside, steering = jnp.abs(errors[LATERAL]), turn.gain[0]
     # A law that does not steer has no approach.
     slope = steering[LATERAL] / jnp.maximum(steering[HEADING], 1e-6)
+    speed = turn.state[PATH_SPEED] + errors[PATH_SPEED]
+    tightest = turn.grip[1] / jnp.maximum(jnp.abs(speed), 1.0) ** 2
     # Not the root of 0, which has no gradient.
-    arc = jnp.sqrt(2.0 * ARC * _tightest(turn, errors) * aside + 1e-9)
+    arc = jnp.sqrt(2.0 * ARC * tightest * aside + 1e-9)
     angle = jnp.minimum(jnp.minimum(slope * aside, arc), STEEPEST)
     # The short way round to the approach angle, not to the heading of the path.
     turned = wrap_angle(errors[HEADING] + jnp.sign(errors[LATERAL]) * angle)
     off = jnp.maximum(jnp.abs(turned), jnp.abs(wrap_angle(errors[HEADING])))
-    return turned, _ramp(off, ASTRAY), jnp.clip(far, 0.0, 1.0)
+    return turned, _ramp(off, ASTRAY), jnp.clip(far, 0.0, 1.0), tightest
 
 
 def recovering(
@@ -121,13 +124,13 @@ def recovering(
     is slower, the more it has to turn, and speeds up once it points the right way;
     steering and drive share the grip a.
     """
-    turned, astray, far = course(turn, errors)
+    turned, astray, far, tightest = course(turn, errors)
     (bend, grip), speed, gain = turn.grip, turn.state[PATH_SPEED], turn.gain
     # Feed-forward helps along the path only; the rates of the body damp a slide.
     ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
     rates = gain[0, PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
     wanted = ahead - gain[0, HEADING] * turned - DAMPING * rates
-    held = bend * _tightest(turn, errors)
+    held = bend * tightest
     most = CORNERING * held + 0.01
     wanted = jnp.clip(wanted, -most, most)
 
@@ -151,12 +154,6 @@ def recovering(
     # A choice, not a mixture with weight 0: near the path the law is bit for bit
     # the linear one, around which models are learned and certified.
     return jnp.where(far > 0.0, linear + far * (beyond - linear), linear)
-
-
-def _tightest(turn: SteadyTurn, errors: PathState) -> Scalar:
-    """Curvature that the grip allows [1/m]."""
-    speed = turn.state[PATH_SPEED] + errors[PATH_SPEED]
-    return turn.grip[1] / jnp.maximum(jnp.abs(speed), 1.0) ** 2
 
 
 def _ramp(value: Scalar, rise: tuple[float, float]) -> Scalar:

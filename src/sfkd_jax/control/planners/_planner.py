@@ -206,7 +206,7 @@ class Planner(Stateful):
         elapsed = jnp.where(jnp.isnan(tuning.elapsed), 1.0, tuning.elapsed)
         # The stored plan begins one period after the last call; this one may be later.
         late = jnp.maximum(elapsed - 1.0, 0.0)
-        before, held = shift(state.plan, late), shift(state.controls, late)
+        before, held = shift((state.plan, state.controls), late)
 
         # Everything that all samples share is computed once, outside the rollouts.
         start = PlanningStart(state.previous, state.started)
@@ -232,9 +232,10 @@ class Planner(Stateful):
         control = jnp.clip(controls[0], task.low, task.high)
         # Further delay is made up for by the next call.
         elapsed = jnp.minimum(elapsed, 1.0)
+        plan, controls = shift((plan, controls), elapsed)
         after = PlannerState(
-            plan=shift(plan, elapsed),
-            controls=shift(controls, elapsed),
+            plan=plan,
+            controls=controls,
             previous=control,
             started=state.started | healthy,
             key=jax.random.key_data(next_key),
@@ -339,15 +340,14 @@ def tuned(state: Memory, **changes: Any) -> Memory:
     return jax.tree.map(change, state, is_leaf=is_planner)
 
 
-def shift(plan: Plan, elapsed: Scalar) -> Plan:
-    """Shift a plan by `elapsed` periods: linear in between, the last step held."""
-    last = plan.shape[0] - 1
-    steps = jnp.arange(plan.shape[0], dtype=plan.dtype)
-    times = jnp.clip(steps + elapsed, 0, last)
+def shift(plans: Any, elapsed: Scalar) -> Any:
+    """Shift plans by `elapsed` periods: linear in between, the last step held."""
+    steps = jnp.arange(len(jax.tree.leaves(plans)[0]), dtype=elapsed.dtype)
+    times = jnp.clip(steps + elapsed, 0, len(steps) - 1)
     whole = jnp.floor(times)
-    index = whole.astype(int)
-    after = plan[jnp.minimum(index + 1, last)]
-    return plan[index] + (times - whole)[:, None] * (after - plan[index])
+    index, share = whole.astype(int), (times - whole)[:, None]
+    after = jnp.minimum(index + 1, len(steps) - 1)
+    return jax.tree.map(lambda p: p[index] + share * (p[after] - p[index]), plans)
 
 
 def replace_nonfinite(

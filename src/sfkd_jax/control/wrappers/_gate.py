@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import Stateful
@@ -31,6 +32,7 @@ from sfkd_jax.geometry import (
     PATH_SPEED,
     PathState,
     is_valid,
+    put,
     wrap_angle,
 )
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
@@ -233,18 +235,21 @@ class Gate(Stateful):
         trusted = preview.trusted & clear & (after.doubt == 0) & ~alarm
         # Nothing to believe and nothing to rely on: stop.
         slower = jnp.minimum(road[:, 1], jnp.maximum(xi[PATH_SPEED] - SLOWING, 0.0))
-        road = jnp.where(lost, road.at[:, 1].set(slower), road)
+        road = jnp.stack([road[:, 0], jnp.where(lost, slower, road[:, 1])], axis=1)
 
         seen = preview._replace(
             road=road, along=after.along, measured=measured, trusted=trusted
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, seen)
 
-        estimate = after.past[0, :-1]
         applied = Applied(control, road[0], info.get("env_estimate", env))
-        unseen = ~measured[LATERAL]
-        expected, modelled, _ = self._predict(params, estimate, applied, unseen)
-        tested = self._expect(tested, params, xi, applied, info, clear & clean)
+        # What an estimator has found and counteracts is not found again.
+        causes = info.get("causes")
+        found = 0.0 * control if causes is None else input_error(causes, road[0])
+        states = jnp.stack([after.past[0, :-1], xi])
+        expected, modelled, tested = self._predict(
+            params, states, applied, found, ~measured[LATERAL], tested, clear & clean
+        )
         innovation = _difference(coordinates, state.expected)
         report: Any = {
             **info,
@@ -305,7 +310,7 @@ class Gate(Stateful):
         longest = jnp.where(late, longest, round(self.patience / self.dt))
         overdue = state.missing >= longest
         # But a yaw alone: the position would show it.
-        overdue = overdue.at[HEADING].set(overdue[HEADING] & ~plausible[LATERAL])
+        overdue = put(overdue, HEADING, overdue[HEADING] & ~plausible[LATERAL])
         measured = usable & (plausible | overdue | ~compared)
         # Either it or all that was believed before is wrong, and nothing says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
@@ -320,7 +325,7 @@ class Gate(Stateful):
         skew = jnp.where((state.skew != 0.0) & stays, state.skew, turned)
         skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
         heading = jnp.where(skewed, coordinates[HEADING] - skew, xi[HEADING])
-        xi = xi.at[HEADING].set(heading)
+        xi = put(xi, HEADING, heading)
 
         # A believed outlier starts anew; noise is averaged.
         estimate = expected + self.gain * _difference(xi, expected)
@@ -353,15 +358,16 @@ class Gate(Stateful):
         which = jnp.argmin(miss)
         # ξ is relative to the circle of the road here, which was another one there.
         turned = jnp.cumsum((bends - curvature) * steps)
-        then = past.at[:, HEADING].add(-turned)[which]
-        then = then.at[LATERAL].add(jnp.cumsum(turned * steps)[which])
+        then = past[which]
+        then = put(then, HEADING, then[HEADING] - turned[which])
+        then = put(then, LATERAL, then[LATERAL] + jnp.cumsum(turned * steps)[which])
         off = _difference(xi, then)
         off = jnp.where(miss[which] <= 0.6 * jnp.abs(steps[which]) + 0.1, off, jnp.nan)
         # Where it was wrong about the heading it went on into the wrong direction.
-        kept = off.at[PATH_SPEED + 1 :].set(0.0)
+        kept = jnp.where(np.arange(len(off)) > PATH_SPEED, 0.0, off)
 
         def gone_on(distance: Scalar) -> PathState:
-            return kept.at[LATERAL].add(distance * off[HEADING])
+            return put(kept, LATERAL, kept[LATERAL] + distance * off[HEADING])
 
         later = jnp.arange(len(behind)) <= which
         change = self.gain * jax.vmap(gone_on)(behind[which] - behind)
@@ -374,43 +380,16 @@ class Gate(Stateful):
         speed = jnp.abs(state.expected[PATH_SPEED])
         return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
 
-    def _expect(
-        self,
-        state: InnovationState | None,
-        params: Params,
-        xi: PathState,
-        applied: Applied,
-        info: ControllerInfo,
-        clear: Bool[Array, ""],
-    ) -> InnovationState | None:
-        """The test with what the next measurement is compared with."""
-        if state is None:
-            return None
-        # What an estimator has found and counteracts is not found again.
-        if "causes" in info:
-            found = input_error(info["causes"], applied.road)
-            applied = applied._replace(control=applied.control + found)
-        unseen = jnp.asarray(False)
-        expected, inside, usual = self._predict(params, xi, applied, unseen)
-        control, road, env = applied
-        nearest = self.conditions.nearest(env)
-        turned = self.dt * turning_rate(self.law, xi, control, road, nearest)
-        expected = jnp.append(expected, xi[HEADING] + turned)
-        return state._replace(
-            expected=jnp.where(clear & inside & usual, expected, jnp.nan),
-            level=steering_level(self.law, road, nearest),
-        )
-
     def _limit(
         self, state: GateState, periods: Scalar, on_time: Bool[Array, ""]
     ) -> Float[Array, " coordinate"]:
         """The largest difference that one step explains, entry by entry."""
         # What a vehicle can reach in a step without knowing its model: sideways what
         # it drives, and more than any tyre turns, accelerates and slides.
-        wide = jnp.full(state.expected.shape, jnp.inf, dtype=float)
-        wide = wide.at[HEADING].set(0.35).at[PATH_SPEED].set(1.5)
+        wide = np.full(state.expected.shape, np.inf, dtype=np.float32)
+        wide[HEADING], wide[PATH_SPEED] = 0.35, 1.5
         wide = wide * jnp.maximum(periods, 1.0)
-        wide = wide.at[LATERAL].set(self._reach(state, periods))
+        wide = put(wide, LATERAL, self._reach(state, periods))
         if self.conditions.state is None:
             return wide
         low, high = map(jnp.asarray, self.conditions.state)
@@ -418,35 +397,59 @@ class Gate(Stateful):
         return jnp.where(state.modelled & on_time, tight, wide)
 
     def _predict(
-        self, params: Params, xi: PathState, applied: Applied, unseen: Bool[Array, ""]
-    ) -> tuple[PathState, Bool[Array, ""], Bool[Array, ""]]:
-        """ξ one step later, whether the model says so, and if ν is as in its data."""
+        self,
+        params: Params,
+        states: Float[Array, "2 coordinate"],
+        applied: Applied,
+        found: Control,
+        unseen: Bool[Array, ""],
+        test: InnovationState | None,
+        clear: Bool[Array, ""],
+    ) -> tuple[PathState, Bool[Array, ""], InnovationState | None]:
+        """ξ̂ one step later, whether the model says so, and what ξ is compared with."""
         control, road, env = applied
-        model = self.model
-        nearest = self.conditions.nearest(env)
-        nu = control - self.law(xi, road[0], road[1], nearest)
-        # Beyond what data and planners add to the law, the model was not learned.
-        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
-        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
-        onward = xi.at[LATERAL].add(sideways)
-        if self.conditions.state is None:
-            # A model that nothing is known of must not overrule a measurement.
-            return onward, jnp.asarray(False), usual
-        fiber = model.fiber(fold(model, params), nearest)
-        ahead = expected_coordinates(model, fiber, xi, nu, road)
-        inside = self.conditions.hold(xi, road) & all_finite(ahead)
-        # A car that is not seen drives on its model somewhat outside as well: a point
-        # that keeps its heading is worse. A measurement is not compared with that.
-        low, high = map(jnp.asarray, self.conditions.state)
-        more = OUTSIDE * (high - low)
-        near = jnp.all((low - more <= xi) & (xi <= high + more)) & all_finite(ahead)
-        return jnp.where(inside | (unseen & near), ahead, onward), inside, usual
+        nearest, box = self.conditions.nearest(env), self.conditions.state
+        turn = self.law.turn(road[0], road[1], nearest)
+        fiber = box and self.model.fiber(fold(self.model, params), nearest)
+
+        def onward(xi: PathState, control: Control, unseen: Bool[Array, ""]) -> Any:
+            nu = control - turn.feedback(xi)
+            # Beyond what data and planners add to the law, no model was learned.
+            usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+            sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
+            straight = put(xi, LATERAL, xi[LATERAL] + sideways)
+            if box is None:
+                # A model that nothing is known of must not overrule a measurement.
+                return straight, jnp.asarray(False), usual
+            ahead = expected_coordinates(self.model, fiber, xi, nu, road)
+            inside = self.conditions.hold(xi, road) & all_finite(ahead)
+            # A car that is not seen drives on its model somewhat outside as well: a
+            # point that keeps its heading is worse.
+            low, high = map(np.asarray, box)
+            more = OUTSIDE * (high - low)
+            near = jnp.all((low - more <= xi) & (xi <= high + more)) & all_finite(ahead)
+            return jnp.where(inside | (unseen & near), ahead, straight), inside, usual
+
+        cases = (
+            jnp.stack([control, control + found]),
+            jnp.stack([unseen, jnp.asarray(False)]),
+        )
+        after, inside, usual = jax.vmap(onward)(states, *cases)
+        if test is not None:
+            xi = states[1]
+            turned = self.dt * turning_rate(
+                self.law, xi, control + found, road, nearest
+            )
+            ahead = jnp.append(after[1], xi[HEADING] + turned)
+            expected = jnp.where(clear & inside[1] & usual[1], ahead, jnp.nan)
+            test = test._replace(expected=expected, level=steering_level(turn))
+        return after[0], inside[0], test
 
 
 def _difference(xi: PathState, other: PathState) -> PathState:
     """ξ − ξ', the heading wrapped."""
     gap = xi - other
-    return gap.at[HEADING].set(wrap_angle(gap[HEADING]))
+    return put(gap, HEADING, wrap_angle(gap[HEADING]))
 
 
 def _elapsed(state: Any) -> Scalar:

@@ -248,13 +248,12 @@ class Shield(Stateful):
         """Return the state before the first control step."""
         states, environments = self._sizes
 
-        def encode(key: Key) -> Latent:
-            params = fold(self.model, self.model.init(key))
+        def encode(params: Params) -> Latent:
             fiber = self.model.fiber(params, jnp.zeros(environments))
             return self.model.encode(fiber, path_state(jnp.zeros(states)))
 
         # Only shapes are evaluated.
-        latent = jax.eval_shape(encode, key)
+        latent = jax.eval_shape(encode, jax.eval_shape(self.model.init, key))
         return ShieldState(
             inner=self.inner.init(key),
             latent=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), latent),
@@ -277,8 +276,11 @@ class Shield(Stateful):
         planned, inner, info = self.inner.act(
             params, state.inner, coordinates, env, preview
         )
-        now, fiber, law_control, flags = self._compare(
-            params, state._replace(inner=inner), coordinates, env, preview
+        road, nearest = self._road(preview), self.conditions.nearest(env)
+        turn = self.law.turn(road[0, 0], road[0, 1], nearest)
+        law_control = turn.feedback(coordinates)
+        now, fiber, flags = self._compare(
+            params, state._replace(inner=inner), coordinates, env, preview, law_control
         )
         # A plan that continues an old one is worse than the law, which sees the car.
         usable = all_finite(planned) & info.get("healthy", True)
@@ -287,7 +289,6 @@ class Shield(Stateful):
         request = jnp.where(usable, request, 0.0)
         # Outside the box no request is admissible: the law drives alone.
         limit = jnp.where(flags["outside_box"], 0.0, self.law.perturbation)
-        road = self._road(preview)
         chosen = safety_filter(
             self.model, fiber, now.latent, request, road, limit, width=self.width
         )
@@ -303,9 +304,8 @@ class Shield(Stateful):
         speed = road[0, 1]
         still = drive - holding(coordinates[PATH_SPEED], speed)
         stands = now.started & (speed == 0.0)
-        control = control.at[1].set(
-            jnp.where(stands, jnp.clip(still, low[1], 0.0), drive)
-        )
+        drive = jnp.where(stands, jnp.clip(still, low[1], 0.0), drive)
+        control = jnp.stack([control[0], drive])
 
         cut = jnp.where(flags["outside_box"], 1.0, 1.0 - chosen.scale)
         feasible = now.started & chosen.feasible
@@ -335,7 +335,7 @@ class Shield(Stateful):
         # A latent that is not finite would stay so: the nominal model starts anew.
         running = applies & all_finite(chosen.latent)
         latent = jax.tree.map(partial(jnp.where, running), chosen.latent, now.latent)
-        aside = self._aside(coordinates, road[0], now.env)
+        aside = self._aside(coordinates, road[0], turn.state[HEADING])
         after = now._replace(
             latent=latent,
             started=running,
@@ -354,12 +354,9 @@ class Shield(Stateful):
         )
         return slow if given is None else slow | (road[1] < given[0][1])
 
-    def _aside(
-        self, xi: PathState, road: Float[Array, " 2"], env: Environment
-    ) -> Scalar:
+    def _aside(self, xi: PathState, road: Float[Array, " 2"], steady: Scalar) -> Scalar:
         """How far a step moves the car across the path: v dt |sin χ| [m]."""
         slowest = self.law.low[1]
-        steady = self.law.turn(road[0], road[1], env).state[HEADING]
         # The table ends at its lowest speed; below, the tyres slip less, and the car
         # turns about its rear axle.
         slower = 1.0 - jnp.minimum(road[1] / slowest, 1.0) ** 2
@@ -378,12 +375,13 @@ class Shield(Stateful):
         coordinates: PathState,
         env: Environment,
         preview: Preview,
-    ) -> tuple[ShieldState, Fiber, Control, dict[str, Any]]:
-        """Compare the nominal model with a measurement, and evaluate the law.
+        law_control: Control,
+    ) -> tuple[ShieldState, Fiber, dict[str, Any]]:
+        """Compare the nominal model with a measurement.
 
         Returns:
             The nominal model in the fibre of the current environment, at the measured
-            ξ if it starts anew; the fibre; the law's control; entries of `info`.
+            ξ if it starts anew; the fibre; entries of `info`.
         """
         model, road = self.model, preview.road[0]
         inside = self.conditions.nearest(env)
@@ -398,7 +396,6 @@ class Shield(Stateful):
             jnp.all(inside == before.env), lambda: before.latent, switched
         )
         anchor = model.encode(fiber, path_state(coordinates))
-        law_control = self.law(coordinates, road[0], road[1], inside)
         readable = all_finite((anchor, law_control))
         compared = before.started & preview.measured[LATERAL]
         distance = jnp.abs(coordinates - model.decode(fiber, latent)[BODY])[LATERAL]
@@ -421,7 +418,7 @@ class Shield(Stateful):
         }
         offset = jnp.where(moved, self.start_error, before.offset)
         now = before._replace(latent=latent, started=started, env=inside, offset=offset)
-        return now, fiber, law_control, flags
+        return now, fiber, flags
 
 
 def _request(

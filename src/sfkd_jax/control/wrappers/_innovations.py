@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.laws._recovery import SteadyTurn
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.types import BODY, Control, Environment, Fiber, Model, Scalar
 
@@ -87,7 +88,7 @@ class InnovationTest(NamedTuple):
         deviation = jax.vmap(lambda column: jnp.interp(level, self.levels, column))
         # Of all its entries: where a model errs in one, it errs in others for a while.
         ratio = jnp.max((deviation(self.deviation.T) / usual)[:-1])
-        ratio = jnp.ones_like(usual).at[:-1].set(jnp.maximum(ratio, 1.0))
+        ratio = jnp.append(jnp.full_like(usual[1:], jnp.maximum(ratio, 1.0)), 1.0)
         score = innovation / (usual * ratio**2)
         moved = means + jnp.asarray(WINDOWS)[:, None] * (score - means)
         # Held, not towards zero: a sensor that fails must not end an alarm.
@@ -119,10 +120,10 @@ def turning_rate(
     return xi[PATH_SPEED] * (turn - path)
 
 
-def steering_level(law: PathLaw, road: Float[Array, " 2"], env: Environment) -> Scalar:
-    """Return the law's steering per heading error.
+def steering_level(turn: SteadyTurn) -> Scalar:
+    """Return a law's steering per heading error.
 
     The less the tyres give, the more the law steers and the larger are the errors of a
     model: one number for how near a turn is to the limit of grip.
     """
-    return jnp.abs(law.turn(road[0], road[1], env).gain[0, HEADING])
+    return jnp.abs(turn.gain[0, HEADING])
