@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import rotate, wrap_angle
@@ -47,10 +46,10 @@ def folded(model: Model, params: Params) -> Params:
     """Return `fold` of parameters, by one program for all who need it of a model."""
     if model.shared is None or isinstance(params, Folded):
         return params
-    return jax.device_put(on_host(fold, model, params))
+    return Folded(params, jax.device_put(on_host(model.shared, params)))
 
 
-def on_host(function: Callable[..., Any], model: Model, params: Params) -> Any:
+def on_host(function: Callable[[Params], Any], params: Params) -> Any:
     """Evaluate a function of parameters on the host, or else in full precision.
 
     Accelerators round float32 factors to ten bits, which the witnesses of another
@@ -61,10 +60,7 @@ def on_host(function: Callable[..., Any], model: Model, params: Params) -> Any:
     except RuntimeError:  # JAX_PLATFORMS names accelerators only
         host = None
     with jax.default_device(host), jax.default_matmul_precision("float32"):
-        evaluated = jax.jit(function, static_argnums=0)(
-            model, jax.tree.map(np.asarray, params)
-        )
-    return jax.tree.map(np.asarray, evaluated)
+        return jax.device_get(jax.jit(function)(jax.device_get(params)))
 
 
 def unfold(params: Params) -> Params:

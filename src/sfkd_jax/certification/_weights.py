@@ -70,9 +70,10 @@ def exported(model: Model, params: Params) -> Exported:
 
     They are those of the folded parameters, which a controller multiplies.
     """
-    if model.structure.explicit is None:
+    explicit = model.structure.explicit
+    if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    weights = on_host(_explicit, model, folded(model, params))
+    weights = on_host(explicit, folded(model, params))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
@@ -93,11 +94,6 @@ def exported(model: Model, params: Params) -> Exported:
         f"the transport {transport!r} is not known to be nonexpansive",
     )
     return weights
-
-
-def _explicit(model: Model, params: Params) -> Any:
-    assert model.structure.explicit is not None
-    return model.structure.explicit(params)
 
 
 def fingerprint(params: Params) -> str:

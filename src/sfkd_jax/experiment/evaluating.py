@@ -168,7 +168,6 @@ class SystemEvaluation:
             self.controller = _in_lane(name, system, plant, settings, self.controller)
         # Folded once here; otherwise every control step would fold again.
         self.params = folded(system.model, system.params)
-        self._system = system._replace(params=self.params)
         self._columns = _columns(settings, name, system)
         simulate = partial(
             evaluation.simulate,

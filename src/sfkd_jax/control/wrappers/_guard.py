@@ -347,11 +347,7 @@ class Shield(Stateful):
     def _slow(self, xi: PathState, road: Float[Array, " 2"]) -> Bool[Array, ""]:
         """Whether the car or its reference is slower than the conditions."""
         state, given = self.conditions.state, self.conditions.road
-        slow = (
-            jnp.asarray(False)
-            if state is None
-            else xi[PATH_SPEED] < state[0][PATH_SPEED]
-        )
+        slow = xi[PATH_SPEED] < (-jnp.inf if state is None else state[0][PATH_SPEED])
         return slow if given is None else slow | (road[1] < given[0][1])
 
     def _aside(self, xi: PathState, road: Float[Array, " 2"], steady: Scalar) -> Scalar:
