@@ -42,7 +42,7 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
-def put(vector: Float[Array, " n"], index: int, value: Scalar) -> Float[Array, " n"]:
+def put(vector: Array, index: int, value: Array) -> Array:
     """Return the vector with another entry.
 
     A choice, not a scatter: XLA then evaluates it along with what is around it.
