@@ -386,9 +386,9 @@ class Gate(Stateful):
         """The largest difference that one step explains, entry by entry."""
         # What a vehicle can reach in a step without knowing its model: sideways what
         # it drives, and more than any tyre turns, accelerates and slides.
-        wide = np.full(state.expected.shape, np.inf, dtype=np.float32)
-        wide[HEADING], wide[PATH_SPEED] = 0.35, 1.5
-        wide = wide * jnp.maximum(periods, 1.0)
+        most = {HEADING: 0.35, PATH_SPEED: 1.5}
+        most = [most.get(i, np.inf) for i in range(state.expected.shape[0])]
+        wide = jnp.asarray(most) * jnp.maximum(periods, 1.0)
         wide = put(wide, LATERAL, self._reach(state, periods))
         if self.conditions.state is None:
             return wide
