@@ -276,8 +276,7 @@ def restore(path: str | Path) -> TrainedModel:
     version = manifest["versions"].get("sfkd_jax")
     advice = f"saved by sfkd_jax {version}: train again"
     with store.as_artefact_error(file, ValueError, advice=advice):
-        parts = {name: settings[name] for name in ("vehicle", "space", "model")}
-        vehicle, model = _build(json.dumps(parts))
+        vehicle, model = built(settings)
         # Settings of a wrong type fail only here. Weights are float32 in any process.
         with jax.enable_x64(False):
             shapes = jax.eval_shape(model.init, jax.eval_shape(jax.random.key, 0))
@@ -451,6 +450,12 @@ def read_certificate(
     except certification.CertificationRefused as reason:
         raise store.ArtefactError(f"{file}: {reason}") from None
     return document, ""
+
+
+def built(settings: Values) -> tuple[Vehicle, Model]:
+    """Return vehicle and model of settings, the same ones for all who ask."""
+    parts = {name: settings[name] for name in ("vehicle", "space", "model")}
+    return _build(json.dumps(store.plain(parts), sort_keys=True))
 
 
 @lru_cache(maxsize=8)

@@ -91,8 +91,10 @@ def split(
     sizes = sizes_of_parts(count, shares)
     if min(sizes) < 1:
         raise ValueError(f"{count} trajectories are too few for shares {tuple(shares)}")
+    # On the host: each of the many operations would be a program of its own.
+    trajectories = jax.device_get(trajectories)
     for name in ("states", "controls"):
-        if not bool(jnp.all(jnp.isfinite(getattr(trajectories, name)))):
+        if not np.isfinite(getattr(trajectories, name)).all():
             raise ValueError(
                 f"{name} of the trajectories are not finite: "
                 "check the vehicle that drove them"
@@ -104,16 +106,19 @@ def split(
             f"got {env_low} and {env_high}"
         )
     # Not "any outside": a NaN is neither inside nor outside.
-    if not bool(jnp.all((envs >= env_low - 1e-5) & (envs <= env_high + 1e-5))):
+    low, high = np.asarray(env_low) - 1e-5, np.asarray(env_high) + 1e-5
+    if not np.all((envs >= low) & (envs <= high)):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
-    rows = jnp.split(jax.random.permutation(key, count), np.cumsum(sizes)[:-1])
-    parts = [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in rows]
+    rows = jax.device_get(jax.random.permutation(key, count))
+    rows = np.split(rows, np.cumsum(sizes)[:-1])
+    parts = jax.device_put(
+        [jax.tree.map(lambda a, i=index: a[i], trajectories) for index in rows]
+    )
     # Labels in the same order, so that a part knows its scenarios.
     labels = None
     if scenarios is not None:
-        labels = {
-            name: scenarios[index] for name, index in zip(PARTS, rows, strict=True)
-        }
+        own = jax.device_put([np.asarray(scenarios)[index] for index in rows])
+        labels = dict(zip(PARTS, own, strict=True))
     corners = {"env_low": jnp.asarray(env_low), "env_high": jnp.asarray(env_high)}
     return Dataset(*parts, **corners, scenarios=labels)
 

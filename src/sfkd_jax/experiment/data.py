@@ -170,7 +170,7 @@ def read(settings: Settings) -> tuple[Dataset, str]:
     arrays, manifest = store.read_arrays(path, kind=DATASET, config=config(settings))
 
     def named(name: str) -> list[jax.Array]:
-        return [jnp.asarray(arrays[f"{part}/{name}"]) for part in PARTS]
+        return jax.device_put([arrays[f"{part}/{name}"] for part in PARTS])
 
     with store.as_artefact_error(path):
         fields = map(named, Trajectory._fields)

@@ -137,9 +137,9 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     run_dir, options = settings.run_dir, settings.training
     recorded = runs.policy_settings(settings, dataset)
     space = measure_space(dataset)
-    model = build.build_model(
-        settings.model, space, build.build_vehicle(settings.vehicle)
-    )
+    recorded["space"] = space._asdict()
+    # That of `restore`, for which everything is then compiled already.
+    _, model = policy.built(recorded)
     names = settings.environment.names or policy.FRICTION_AND_WIND
     if settings.environment.is_known and not settings.logs:
         box = zip(names, dataset.env_low, dataset.env_high, strict=False)
@@ -188,7 +188,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
         scores = scores.reshape(-1, rows.size)[:, rows]
     document["validation_score"] = float(scores.mean())
     store.write_json(run_dir / "open_loop.json", document)
-    recorded |= {"space": space._asdict(), "best_step": best}
+    recorded["best_step"] = best
     policy.save(
         settings.policy_path,
         params,
