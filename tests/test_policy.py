@@ -48,6 +48,15 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
         control.tuned((), elapsed=1.0)
 
 
+def test_a_policy_is_loaded_by_few_programs(caplog):
+    policy._build.cache_clear()
+    with jax.log_compiles():
+        policy.load(demo.SHIPPED / "kinematic_path").controller.init(KEY)
+    made = [text for text in caplog.messages if "XLA compilation of" in text]
+    # Weights, their explicit form, limits, the state: not one for every array.
+    assert 3 <= len(made) <= 5, made
+
+
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
     trained = load(vehicle)

@@ -43,10 +43,7 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
 
 
 def put(vector: Array, index: int, value: Array) -> Array:
-    """Return the vector with another entry.
-
-    A choice, not a scatter: XLA then evaluates it along with what is around it.
-    """
+    """Return the vector with another entry; a choice fuses where a scatter does not."""
     return jnp.where(np.arange(vector.shape[0]) == index, value, vector)
 
 

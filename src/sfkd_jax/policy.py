@@ -19,7 +19,7 @@ from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, behind, law_from_arrays, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
-from sfkd_jax.rollout import folded, unfold
+from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Model, Params
 
@@ -327,7 +327,7 @@ def load(
     """
     trained, file = restore(path), _file(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
-    trained = replace(trained, params=folded(trained.model, trained.params))
+    trained = replace(trained, params=fold(trained.model, trained.params, on_host))
     certificate, reason = read_certificate(path, trained)
     with store.as_artefact_error(file):
         reads = trained.settings["model"].get("environment", True)

@@ -30,27 +30,8 @@ class Folded(NamedTuple):
     shared: Any  # `Model.shared` of these parameters
 
 
-def fold(model: Model, params: Params) -> Params:
-    """Evaluate once what every control step would otherwise evaluate again.
-
-    `policy.load` does this; a program that controls with parameters it has just trained
-    calls `folded`.
-    """
-    # Folding twice would wrap the weights twice, and `unfold` removes one layer.
-    if model.shared is None or isinstance(params, Folded):
-        return params
-    return Folded(params, model.shared(params))
-
-
-def folded(model: Model, params: Params) -> Params:
-    """Return `fold` of parameters, by one program for all who need it of a model."""
-    if model.shared is None or isinstance(params, Folded):
-        return params
-    return Folded(params, jax.device_put(on_host(model.shared, params)))
-
-
 def on_host(function: Callable[[Params], Any], params: Params) -> Any:
-    """Evaluate a function of parameters on the host, or else in full precision.
+    """Evaluate on the host, or else in full precision, as one program.
 
     Accelerators round float32 factors to ten bits, which the witnesses of another
     machine do not survive.
@@ -60,7 +41,24 @@ def on_host(function: Callable[[Params], Any], params: Params) -> Any:
     except RuntimeError:  # JAX_PLATFORMS names accelerators only
         host = None
     with jax.default_device(host), jax.default_matmul_precision("float32"):
-        return jax.device_get(jax.jit(function)(jax.device_get(params)))
+        evaluated = jax.jit(function)(jax.device_get(params))
+    return jax.device_put(jax.device_get(evaluated))
+
+
+def fold(
+    model: Model,
+    params: Params,
+    evaluate: Callable[..., Any] = lambda shared, params: shared(params),
+) -> Params:
+    """Evaluate once what every control step would otherwise evaluate again.
+
+    Outside of a program with `evaluate=on_host`, as `policy.load` does: one program
+    then serves all who fold parameters of this model.
+    """
+    # Folding twice would wrap the weights twice, and `unfold` removes one layer.
+    if model.shared is None or isinstance(params, Folded):
+        return params
+    return Folded(params, evaluate(model.shared, params))
 
 
 def unfold(params: Params) -> Params:

@@ -8,13 +8,7 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax import control, plants
-from sfkd_jax.geometry import (
-    CURVATURE,
-    HEADING,
-    LATERAL,
-    PATH_SPEED,
-    REFERENCE_SPEED,
-)
+from sfkd_jax.geometry import CURVATURE, HEADING, LATERAL, PATH_SPEED, REFERENCE_SPEED
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller, Model
@@ -258,7 +252,9 @@ def build_controller(
         adaptation = control.Adaptation(**around, estimate_env=estimates, **options)
         along = adaptation.controller()
     conditions = _conditions(certificate, env_low, env_high)
-    test = None if estimates else _test(certificate)
+    # Of a certificate without a test: it was made before there was one.
+    entry = ((certificate or {}).get("corridor") or {}).get("innovations")
+    test = control.innovation_test(entry) if entry and not estimates else None
     return _gated(along, searches, model, plant, law, conditions, test, estimates)
 
 
@@ -375,12 +371,6 @@ def _rear(law: control.PathLaw) -> float:
     sideways = side * (2.0 * row / last - 1.0)
     bends = sideways / slow**2 - sideways / fast**2
     return max(float(np.median(gentle[-1] - gentle[0]) / bends), 0.0)
-
-
-def _test(certificate: Mapping[str, Any] | None) -> control.InnovationTest | None:
-    """The test of a certificate; None for one without: it was made before there was."""
-    entry = ((certificate or {}).get("corridor") or {}).get("innovations")
-    return entry and control.innovation_test(entry)
 
 
 def build_in_lane(

@@ -12,17 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax.certification._measured import alarm_thresholds
-from sfkd_jax.control import (
-    InnovationTest,
-    PathLaw,
-    expected_coordinates,
-    steering_level,
-    turning_rate,
-)
+from sfkd_jax.control import InnovationTest, PathLaw, expected_coordinates, turning_rate
 from sfkd_jax.data import sensor_keys
 from sfkd_jax.geometry import HEADING, LATERAL, PERTURBATION
 from sfkd_jax.plants import Vehicle, along_path
-from sfkd_jax.rollout import folded, rollout
+from sfkd_jax.rollout import fold, on_host, rollout
 from sfkd_jax.types import (
     BODY,
     Control,
@@ -70,7 +64,7 @@ def closed_loop(
             "model.frame=path"
         )
     closed = along_path(plant, law, perturbation=law.perturbation)
-    return Loop(closed, law, model, folded(model, params), tuple(noise))
+    return Loop(closed, law, model, fold(model, params, on_host), tuple(noise))
 
 
 def sensor_effect(
@@ -81,9 +75,8 @@ def sensor_effect(
     spread = spread_of(loop.noise, state.shape[-1])[BODY]
     measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
     # A law is a known function: reading ξ + n acts like a perturbation of ν.
-    return loop.law(measured, road[0], road[1], env) - loop.law(
-        coordinates, road[0], road[1], env
-    )
+    turn = loop.law.turn(road[0], road[1], env)
+    return turn.feedback(measured) - turn.feedback(coordinates)
 
 
 def spread_of(noise: tuple[float, ...], size: int) -> Array:
@@ -133,10 +126,11 @@ def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:
         fiber, road = model.fiber(loop.params, env), inputs[2:]
         # ν beside the law of what was measured: the noise in the control cancels.
         expected = expected_coordinates(model, fiber, xi, inputs[:2], road)
-        control = law(xi, road[0], road[1], env) + inputs[:2]
+        turn = law.turn(road[0], road[1], env)
+        control = turn.feedback(xi) + inputs[:2]
         turned = loop.plant.dt * turning_rate(law, xi, control, road, env)
         innovation = jnp.append(after - expected, (after - xi)[HEADING] - turned)
-        return innovation, steering_level(law.turn(road[0], road[1], env))
+        return innovation, turn.level
 
     measured = runs.states[:, :-1, BODY] + spread * noise
     given = measured[:, :-1], measured[:, 1:], runs.controls[:, :-1], runs.envs[:, :-1]

@@ -14,7 +14,7 @@ import scipy
 from sfkd_jax.certification._claims import FLOAT32, Box, Claims, attack_limits, decoders
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
-from sfkd_jax.rollout import folded
+from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.types import POSE, Key, Model, Params
 
 PAIRS = 256
@@ -51,7 +51,7 @@ def attack_claims(
     )
     if starts:
         # Folded once: each of many thousand steps would bound the weights again.
-        reached |= attack_model(model, folded(model, params), box, starts=starts)
+        reached |= attack_model(model, fold(model, params, on_host), box, starts=starts)
     for name, value in reached.items():
         # `not <=` instead of `>`: a NaN contradicts the bound as well.
         if not value <= limits[name] * (1 + FLOAT32):

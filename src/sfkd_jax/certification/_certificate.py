@@ -43,7 +43,7 @@ from sfkd_jax.certification._weights import (
     well_formed,
 )
 from sfkd_jax.ranges import Fraction, NonNegativeInt
-from sfkd_jax.rollout import folded
+from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.types import Model, Params, Trajectory
 
 MARGIN = 1e-4
@@ -145,8 +145,6 @@ def verify(
 ) -> None:
     """Check a certificate against weights without any search.
 
-    Takes milliseconds once `model.structure.explicit` is compiled.
-
     Args:
         certificate: from an untrusted source.
         params: the weights.
@@ -247,7 +245,7 @@ def issue(
     except CertificationRefused as reason:
         lyapunov = {"reason": str(reason)}
     # Folded for measurements alone: the proof is about the stored weights.
-    measure = partial(residuals, model, folded(model, params))
+    measure = partial(residuals, model, fold(model, params, on_host))
     reference, scores = measure(validation), measure(calibration)
     unseen = {name: measure(part) for name, part in held_out.items()}
     outputs, largest = {}, None

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 
-from sfkd_jax.rollout import folded, on_host, unfold
+from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.types import Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
@@ -73,7 +73,7 @@ def exported(model: Model, params: Params) -> Exported:
     explicit = model.structure.explicit
     if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    weights = on_host(explicit, folded(model, params))
+    weights = on_host(explicit, fold(model, params, on_host))
     # float32 numbers are float64 numbers exactly: nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))

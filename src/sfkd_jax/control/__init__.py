@@ -52,6 +52,5 @@ from sfkd_jax.control.wrappers._innovations import (
     expected_coordinates as expected_coordinates,
 )
 from sfkd_jax.control.wrappers._innovations import innovation_test as innovation_test
-from sfkd_jax.control.wrappers._innovations import steering_level as steering_level
 from sfkd_jax.control.wrappers._innovations import turning_rate as turning_rate
 from sfkd_jax.geometry import reference_curvature as reference_curvature

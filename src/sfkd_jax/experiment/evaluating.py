@@ -21,7 +21,7 @@ from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle, check_step
-from sfkd_jax.rollout import folded, unfold
+from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.scenarios import CAR, COURSES, Scenario
 from sfkd_jax.settings import arguments, choose, replace
 from sfkd_jax.types import Controller, Key
@@ -167,7 +167,7 @@ class SystemEvaluation:
         if has_course(settings):
             self.controller = _in_lane(name, system, plant, settings, self.controller)
         # Folded once here; otherwise every control step would fold again.
-        self.params = folded(system.model, system.params)
+        self.params = fold(system.model, system.params, on_host)
         self._columns = _columns(settings, name, system)
         simulate = partial(
             evaluation.simulate,

@@ -29,7 +29,7 @@ from sfkd_jax.experiment.options import Settings
 from sfkd_jax.models import physics
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.ranges import imported
-from sfkd_jax.rollout import folded
+from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.settings import arguments, choose
 from sfkd_jax.training import descend, fit, multi_step_loss, planning_loss
 from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
@@ -231,7 +231,7 @@ def _open_loop_document(
             "speed_rmse_m_per_s": speed.tolist(),
         }
 
-    own, of_others = errors(folded(model, params), dataset.test)
+    own, of_others = errors(fold(model, params, on_host), dataset.test)
     return {
         "steps": list(range(1, horizon + 1)),
         "dt": plant.dt,

@@ -78,6 +78,14 @@ class SteadyTurn(NamedTuple):
         errors = coordinates - self.state
         return recovering(self, errors, self.control - self.gain @ errors)
 
+    @property
+    def level(self) -> Scalar:
+        """The law's steering per heading error: the less the tyres give, the larger.
+
+        So are the errors of a model: it tells how near a turn is to the limit of grip.
+        """
+        return jnp.abs(self.gain[0, HEADING])
+
     def authority(self, coordinates: PathState) -> Scalar:
         """Return the share of a planner's perturbation that acts, 1 near the path.
 

@@ -23,7 +23,6 @@ from sfkd_jax.control.wrappers._innovations import (
     InnovationState,
     InnovationTest,
     expected_coordinates,
-    steering_level,
     turning_rate,
 )
 from sfkd_jax.geometry import (
@@ -386,9 +385,8 @@ class Gate(Stateful):
         """The largest difference that one step explains, entry by entry."""
         # What a vehicle can reach in a step without knowing its model: sideways what
         # it drives, and more than any tyre turns, accelerates and slides.
-        most = {HEADING: 0.35, PATH_SPEED: 1.5}
-        most = [most.get(i, np.inf) for i in range(state.expected.shape[0])]
-        wide = jnp.asarray(most) * jnp.maximum(periods, 1.0)
+        rest = [jnp.inf] * (state.expected.shape[0] - 3)
+        wide = jnp.asarray([0.0, 0.35, 1.5, *rest]) * jnp.maximum(periods, 1.0)
         wide = put(wide, LATERAL, self._reach(state, periods))
         if self.conditions.state is None:
             return wide
@@ -442,7 +440,7 @@ class Gate(Stateful):
             )
             ahead = jnp.append(after[1], xi[HEADING] + turned)
             expected = jnp.where(clear & inside[1] & usual[1], ahead, jnp.nan)
-            test = test._replace(expected=expected, level=steering_level(turn))
+            test = test._replace(expected=expected, level=turn.level)
         return after[0], inside[0], test
 
 

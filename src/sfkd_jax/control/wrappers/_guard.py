@@ -23,13 +23,7 @@ from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._gate import ANYWHERE, Box, Conditions
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
-from sfkd_jax.ranges import (
-    AtLeastOne,
-    Fraction,
-    NonNegative,
-    Positive,
-    check_intervals,
-)
+from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -233,20 +227,15 @@ class Shield(Stateful):
                 "a shield needs a model in path coordinates: model.frame=path"
             )
         check_intervals(self)
-        states, environments = self._sizes
+        states, environments = self.law.gain.shape[-1], len(self.law.low) - 2
         _check_box("control", self.control, 2)
         _check_box("env", self.conditions.env, environments)
         _check_box("state", self.conditions.state, states)
         _check_box("road", self.conditions.road, 2)
 
-    @property
-    def _sizes(self) -> tuple[int, int]:
-        """Numbers of entries of ξ and of e."""
-        return self.law.gain.shape[-1], self.law.low.shape[0] - 2
-
     def init(self, key: Key) -> ShieldState:
         """Return the state before the first control step."""
-        states, environments = self._sizes
+        states, environments = self.law.gain.shape[-1], len(self.law.low) - 2
 
         def encode(params: Params) -> Latent:
             fiber = self.model.fiber(params, jnp.zeros(environments))

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.laws._recovery import SteadyTurn
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
 from sfkd_jax.types import BODY, Control, Environment, Fiber, Model, Scalar
 
@@ -29,7 +28,7 @@ class InnovationState(NamedTuple):
 
     # Of this step, predicted from the last measured one; NaN without.
     expected: Readings
-    level: Scalar  # of the prediction, see `steering_level`
+    level: Scalar  # of the prediction, see `SteadyTurn.level`
     means: Means  # moving means of the scores
     alarm: Bool[Array, ""]  # whether the last step raised or kept one
 
@@ -49,7 +48,7 @@ class InnovationTest(NamedTuple):
     steady turn that the law knows for the steering: exact where F is not.
 
     Attributes:
-        levels: rising, of `steering_level`.
+        levels: rising, of `SteadyTurn.level`.
         deviation: σ of r at these levels, in units of ξ.
         threshold: of the moving means, for each of `WINDOWS`.
     """
@@ -118,12 +117,3 @@ def turning_rate(
     path = road[0] * jnp.cos(xi[HEADING]) / (1.0 - road[0] * xi[LATERAL])
     turn = law.curvature(control[0], xi[PATH_SPEED], env)
     return xi[PATH_SPEED] * (turn - path)
-
-
-def steering_level(turn: SteadyTurn) -> Scalar:
-    """Return a law's steering per heading error.
-
-    The less the tyres give, the more the law steers and the larger are the errors of a
-    model: one number for how near a turn is to the limit of grip.
-    """
-    return jnp.abs(turn.gain[0, HEADING])
