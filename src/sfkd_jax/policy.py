@@ -273,8 +273,7 @@ def restore(path: str | Path) -> TrainedModel:
     # Before anything is built: building imports and calls what the settings name.
     with store.as_artefact_error(file, ValueError):
         build.check_imported(settings)
-    version = manifest["versions"].get("sfkd_jax")
-    advice = f"saved by sfkd_jax {version}: train again"
+    advice = f"saved by sfkd_jax {manifest['versions'].get('sfkd_jax')}: train again"
     with store.as_artefact_error(file, ValueError, advice=advice):
         vehicle, model = built(settings)
         # Settings of a wrong type fail only here. Weights are float32 in any process.
@@ -488,8 +487,7 @@ def _weights(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Param
         raise store.ArtefactError(
             f"{file}: weights {name} are {found}, the model has {wanted}"
         )
-    # In the order of the tree, whatever that of the file is. `jnp.asarray` compiles
-    # a program for each shape.
+    # In the order of the tree, whatever that of the file is.
     leaves = jax.device_put([arrays[name] for name in needed])
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
