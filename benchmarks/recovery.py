@@ -11,14 +11,13 @@ one line a row.
 import time
 from collections import namedtuple
 from functools import partial
-from itertools import product
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-from benchmarks import arguments, device, search, total, write
+from benchmarks import arguments, device, write
 from benchmarks.device import CARS, HORIZON, NOISE, PERIOD
 from benchmarks.device import SHIPPED as SHIPPED
 from sfkd_jax import control, geometry, plants, scenarios
@@ -26,8 +25,8 @@ from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
 
-SPACING, TICK = 0.5, 0.02
-"""Of path points [m]; of the cars between calls [s]."""
+SPACING, TICK, TICKS = 0.5, 0.02, 5
+"""Of path points [m]; of the cars between calls [s]; as many of them a call."""
 PART, PAST, NEAR, LONGEST, POINTS = 50, 51, 100, 600, 1752
 """Steps of a compiled part; readings kept; path points searched to each side; steps of
 the longest runs; points of their roads, which last a quarter longer at 10 m/s.
@@ -59,10 +58,9 @@ CALL = {
 }
 """What a run meets at every call: shape and type; arrays begin (run, time)."""
 Now = namedtuple("Now", CALL)
-Runs = namedtuple("Runs", "start foot road ticks elapsed seed now")
+Runs = namedtuple("Runs", "start foot road seed now")
 """Runs of one length; arrays begin with the run: state and arc length [m] at the start,
-points of the path, `TICK`s between calls, periods between them as told to the planner,
-seed of noise and samples, and what every call meets.
+points of the path, seed of noise and samples, and what every call meets.
 """
 
 
@@ -186,16 +184,13 @@ def part_of_run(car, make, runs, carry):
         wrong = jnp.concatenate([shift, now.offset[2:], now.body])
         seen = past[now.lag] + wrong
         seen = jnp.where(now.lost, jnp.nan, seen)
-        # A request is no plan that could be shifted.
-        if make == car.make_policy:
-            memory = control.tuned(memory, elapsed=runs.elapsed)
         acted, memory, info = make(now).act(
             car.loaded.params, memory, seen, now.told, ahead
         )
         turned = acted.at[0].add(now.steering)
         moved = partial(jax.lax.switch, now.changed, car.steps)
         after = jax.lax.fori_loop(
-            0, runs.ticks, lambda _, x: moved(x, turned, now.env), state
+            0, TICKS, lambda _, x: moved(x, turned, now.env), state
         )
         flags = {
             name: leaf
@@ -235,15 +230,14 @@ def roads(count, seed, conditions=None, bends=None):
     return points, envs
 
 
-def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
+def runs_on(car, road, steps, seed, *, foot=0.0, beside=(), **now):
     """Runs on roads from `foot` [m] on; beside = (e_y, yaw, speed, body …) at the start.
 
     What a call is not given is 0, but v_ref and e; e is told as it is.
     """
     (points, envs), count = road, len(road[0])
-    # e at the time of each call; beyond the schedule its last value stays.
-    at = np.floor(np.arange(steps) * ticks * TICK / PERIOD + 1e-6).astype(int)
-    given = {"speed": 10.0, "env": envs[:, np.minimum(at, LONGEST - 1)]} | now
+    # Beyond the schedule the last value of e stays.
+    given = {"speed": 10.0, "env": envs[:, np.minimum(range(steps), LONGEST - 1)]} | now
     given = {"told": given["env"]} | given
     filled = Now(
         *(
@@ -254,7 +248,6 @@ def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
             for name, (shape, kind) in CALL.items()
         )
     )
-    every = partial(np.full, count)
     foot = np.asarray(foot + np.zeros(count), np.float32)
     here = points[np.arange(count), np.round(foot / SPACING).astype(int)]
     usual = (0.0, 0.0, filled.speed[:, 0])
@@ -268,8 +261,6 @@ def runs_on(car, road, steps, seed, *, ticks=5, foot=0.0, beside=(), **now):
         start=start,
         foot=foot,
         road=points.astype(np.float32),
-        ticks=every(ticks, np.int32),
-        elapsed=every(ticks * TICK / PERIOD, np.float32),
         seed=np.arange(count) + 1000 * seed,
         now=filled,
     )
@@ -521,20 +512,13 @@ ONSET = 60
 
 def lasting(car, steps):
     """Errors that stay: label -> entry of `Now`, and its change after `ONSET`."""
-    time_ = PERIOD * (np.arange(steps) - ONSET)
-    begun, grown = (time_ >= 0).astype(float), np.clip(time_ / 10, 0, 1)
+    begun = (np.arange(steps) >= ONSET).astype(float)
     made = {
         f"steering offset {size} degrees": ("steering", begun * np.deg2rad(size))
         for size in (0.0, 0.5, 1.0, 2.0)
     }
     made["friction told wrong by 0.2"] = "told", np.outer(begun, (0.2, 0.0))
     made["mass + 30 %"], made["tyres - 30 %"] = (("changed", k * begun) for k in (1, 2))
-    # Of every sensor five standard deviations, at once and over ten seconds.
-    for place, name in enumerate(car.loaded.vehicle.state_names[1:], start=1):
-        entry, part = ("offset", slice(3)) if place < 3 else ("body", slice(3, None))
-        way = 5 * car.noise[place] * np.eye(car.states)[place, part]
-        made[f"{name} bias {max(way):.3g}"] = entry, np.outer(begun, way)
-        made[f"{name} drift {max(way) / 10:.2g}/s"] = entry, np.outer(grown, way)
     return made
 
 
@@ -591,47 +575,6 @@ def table_rows(car, most):
         found["rmse_mm"] = shown(1e3 * np.sqrt(np.mean(made["left"][:, 20:] ** 2)), 2)
         found["runs_not_healthy"] = int((~made["healthy"]).any(axis=1).sum())
         yield label, found
-    yield "search over nu and e", searched(car, min(most, 512))
-
-
-def rate_rows(car, most):
-    """S3 at other call rates: ticks between calls, told to the planner or not."""
-    parts = {}
-    for ticks, tells in product((25, 10, 5, 2, 1), (True, False)):
-        runs = runs_on(car, roads(min(most, 48), 8), 400, 8, ticks=ticks)
-        told_ = runs.elapsed if tells else np.ones_like(runs.elapsed)
-        parts[ticks, tells] = runs._replace(elapsed=told_)
-    for (ticks, tells), made in driven(car.policy, parts).items():
-        # Slow ones would reach the end of their road.
-        end = min(400, round(LONGEST * PERIOD / (ticks * TICK)))
-        made = jax.tree.map(lambda leaf, end=end: leaf[:, :end], made)
-        label = f"{round(1 / (ticks * TICK))} calls/s, {'told' if tells else 'untold'}"
-        yield label, claimed(made, car.corridor)
-
-
-def searched(car, many, generations=10, steps=200):
-    """Cross-entropy search for the largest |e_y| over ν and a schedule of e."""
-    random, road = np.random.default_rng(9), roads(1, 9)
-    road = [np.repeat(one, many, axis=0) for one in road]
-    low, high = np.asarray(car.loaded.certificate["env_box"])
-    held, visits = {"nu": 5, "env": 30}, -(-steps // 30)
-    cut, found = 2 * steps // held["nu"], []
-
-    def reward(genes):
-        nu, env = np.split(np.clip(genes, -1.0, 1.0), [cut], axis=1)
-        env = low + (env.reshape(many, -1, 2) + 1.0) / 2.0 * (high - low)
-        env = np.repeat(env, held["env"], axis=1)[:, :steps]
-        nu = np.repeat(nu.reshape(many, -1, 2), held["nu"], axis=1)
-        made = car.guarded(runs_on(car, road, steps, 9, env=env, nu=nu))
-        found.append(claimed(made, car.corridor))
-        return distance(made).max(axis=1)
-
-    size = many, cut + 2 * visits
-    search(random, size, generations if many > 100 else 2, reward)
-    whole = total(found)
-    for k in ("largest_m", "beyond_m"):
-        whole[k] = max(1e9 if f[k] is None else f[k] for f in found)
-    return whole
 
 
 def planner_rows(car, most):
@@ -666,7 +609,6 @@ ROWS = {
     "faults": fault_rows,
     "stops": stop_rows,
     "tables": table_rows,
-    "rates": rate_rows,
     "planners": planner_rows,
     "detection": detection_rows,
 }
