@@ -223,12 +223,11 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
         certified = chain(both, params, run), both.structure.explicit(params)
         return certified, chain(planning, params, run), split, whole
 
-    @jit
     def as_certified(params):
         params = fold(model, params)
         return chain(model, params, run), model.structure.explicit(params)
 
-    alone = as_certified(params)
+    alone = jit(as_certified)(params)
     for size in (0.0, 0.1, 1e30, np.nan):
         more = jax.tree.map(lambda leaf, size=size: leaf + size, params["planning"])
         certified, planned, split, whole = driven({**params, "planning": more})
