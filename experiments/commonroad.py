@@ -47,6 +47,15 @@ def drivers():
     }
 
 
+def of_seven(controller):
+    """A controller of our dynamic car, which begins with the same 7 states, for these."""
+
+    def act(params, memory, state, *rest):
+        return controller.act(params, memory, state[..., :7], *rest)
+
+    return controller._replace(act=act)
+
+
 def roads(car, paths, seconds, seed):
     """S1's paths at every friction, and the same keys for each: (friction x path, …)."""
     road_key, drive_key = jax.random.split(jax.random.key(seed))
@@ -62,7 +71,7 @@ def roads(car, paths, seconds, seed):
 
 def drive(car, controller, params, track):
     """RMSE of the first and of the second half of every run [mm], (friction, path)."""
-    one = driving(car.step, adapters.commonroad_controller(controller), params)
+    one = driving(car.step, of_seven(controller), params)
     lateral = jax.jit(jax.vmap(one))(*track).lateral
     # The second half shows what is left after the causes have been estimated.
     half = lateral.shape[1] // 2

@@ -392,9 +392,7 @@ def test_arguments_of_the_wrong_shape_are_named(exported):
         controller.act(state, observations[0, :3], envs[0], reference)
     with pytest.raises(ValueError, match=r"reference must have shape \(5, 4\)"):
         controller.act(state, observations[0], envs[0], reference[:-1])
-    with pytest.warns(
-        UserWarning, match=r"e is outside its box: friction \[-\] 0\.3 … "
-    ):
+    with pytest.warns(UserWarning, match=r"e left friction \[-\] 0\.3 … "):
         controller.act(state, observations[0], 1e3 * envs[0], reference)
     # On Earth it drives as at home if it is told in float64, and says so if not.
     far, home = np.asarray([2048.0 * 250, 2048.0 * 2200]), (observations[0], reference)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial, wraps
@@ -19,6 +19,7 @@ from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, behind, law_from_arrays, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.plants import Vehicle
+from sfkd_jax.ranges import in_words
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Model, Params
@@ -107,8 +108,8 @@ class Policy(TrainedModel):
         lines = [
             f"Policy of {plant.name} {frame}, a step of {plant.dt:g} s",
             f"states: {', '.join(states)}",
-            f"controls: {_ranges(*controls)}",
-            f"environment, {source}: {_ranges(*known['environment'].values())}",
+            f"controls: {in_words(*controls)}",
+            f"environment, {source}: {in_words(*known['environment'].values())}",
             *self._certified(states[3:], known["environment"]["names"]),
         ]
         return "\n  ".join(lines)
@@ -125,7 +126,7 @@ class Policy(TrainedModel):
             # After ν, which is the planner's.
             for end, inputs in zip((low, high), boxes["control"], strict=True):
                 end += inputs[2:]
-        yield f"certified box: {_ranges(names, low, high)}"
+        yield f"certified box: {in_words(names, low, high)}"
         yield f"proved: alpha {document['alpha']:.4f}, contraction of the model a step"
         d_bar = document.get("d_bar") or {"value": float("nan")}
         measured = f"measured, not signed: d_bar {d_bar['value']:.3g}"
@@ -138,7 +139,7 @@ class Policy(TrainedModel):
         under = corridor["conditions"]
         names, bend = ["speed [m/s]", *env_names], under["peak_curvature"]
         ends = zip(under["speed"], under["env_box"], strict=True)
-        told = _ranges(names, *([speed, *corner] for speed, corner in ends))
+        told = in_words(names, *([speed, *corner] for speed, corner in ends))
         dwell = "{:g} to {:g} s".format(*under["dwell_s"])
         yield f"under: {told}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
         if made := document.get("recorded"):
@@ -213,12 +214,6 @@ class Policy(TrainedModel):
     def weights(self) -> Params:
         """The learned parameters as they were saved, to train on or to save again."""
         return unfold(self.params)
-
-
-def _ranges(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -> str:
-    """Names with their limits, for a person."""
-    rows = zip(names, low, high, strict=False)
-    return ", ".join(f"{name} {a:.3g} … {b:.3g}" for name, a, b in rows)
 
 
 def save(

@@ -91,3 +91,9 @@ def imported(name: str, setting: str) -> Any:
         raise ValueError(
             f"{setting}={name}: {reason}; name it as package.module:function"
         ) from None
+
+
+def in_words(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -> str:
+    """Names with their limits, for a person."""
+    rows = zip(names, low, high, strict=False)
+    return ", ".join(f"{name} {a:.3g} … {b:.3g}" for name, a, b in rows)

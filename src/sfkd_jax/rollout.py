@@ -45,11 +45,7 @@ def on_host(function: Callable[[Params], Any], params: Params) -> Any:
     return jax.device_put(jax.device_get(evaluated))
 
 
-def fold(
-    model: Model,
-    params: Params,
-    evaluate: Callable[..., Any] = lambda shared, params: shared(params),
-) -> Params:
+def fold(model: Model, params: Params, evaluate: Any = None) -> Params:
     """Evaluate once what every control step would otherwise evaluate again.
 
     Outside of a program with `evaluate=on_host`, as `policy.load` does: one program
@@ -58,7 +54,8 @@ def fold(
     # Folding twice would wrap the weights twice, and `unfold` removes one layer.
     if model.shared is None or isinstance(params, Folded):
         return params
-    return Folded(params, evaluate(model.shared, params))
+    shared = model.shared
+    return Folded(params, evaluate(shared, params) if evaluate else shared(params))
 
 
 def unfold(params: Params) -> Params:

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax import BraxVehicle as BraxVehicle
     from sfkd_jax.adapters._brax import brax_plant as brax_plant
-    from sfkd_jax.adapters._commonroad import (
-        commonroad_controller as commonroad_controller,
-    )
     from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
     from sfkd_jax.adapters._gymnasium import GymnasiumLane as GymnasiumLane
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
@@ -26,7 +23,7 @@ if TYPE_CHECKING:
 
 _LAZY = {
     ("_brax", "brax"): ("BraxPlant", "BraxVehicle", "brax_plant"),
-    ("_commonroad", "plants"): ("commonroad_controller", "commonroad_vehicle"),
+    ("_commonroad", "plants"): ("commonroad_vehicle",),
     ("_gymnasium", "gym"): ("GymnasiumLane", "GymnasiumVehicle", "register_gymnasium"),
 }
 """File and the extra that installs what it imports -> its public names."""

@@ -18,7 +18,6 @@ from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
 from sfkd_jax.plants import Vehicle, dynamic, simulator
 from sfkd_jax.ranges import check_choice
-from sfkd_jax.types import Controller, State
 
 SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
 ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
@@ -126,15 +125,6 @@ def commonroad_vehicle(
 def _makes(*settings: Any) -> Callable[[], _HostCar]:
     """One function for equal settings, so that they share their workers."""
     return partial(_HostCar, *settings)
-
-
-def commonroad_controller(controller: Controller) -> Controller:
-    """Return a controller of `plants.dynamic`, 7 states, for such a car."""
-
-    def act(params: Any, memory: Any, state: State, *rest: Any) -> Any:
-        return controller.act(params, memory, state[..., :OBSERVED], *rest)
-
-    return controller._replace(act=act)
 
 
 class _HostCar:

@@ -115,9 +115,6 @@ class SearchSettings(ControllerSettings):
     feedback: Any = None
     gate: Any = None
     adaptation: Any = None
-    # Of policies that were saved by earlier versions: without effect.
-    model_law: Any = None
-    online_tube: Any = None
 
 
 def _controller_schema(planner: str) -> type[ControllerSettings]:

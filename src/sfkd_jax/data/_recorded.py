@@ -17,6 +17,7 @@ from sfkd_jax.data._checks import more
 from sfkd_jax.data._from_logs import fingerprint, log_files
 from sfkd_jax.data._logs import Columns, Log, read_logs
 from sfkd_jax.geometry import PathState
+from sfkd_jax.ranges import in_words
 from sfkd_jax.types import BODY, Control, Environment, Trajectory
 
 ERRORS = ("e_y", "e_psi")
@@ -53,9 +54,7 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
     columns, dt = run_columns(trained), trained.vehicle.dt
     names = [columns.time, *columns.state, *columns.control, *columns.environment]
     rows, size = count(), len(columns.environment) - len(INPUTS)
-    limits = trained.interface["environment"].values()
-    told = (f"{one} {a:.3g} … {b:.3g}" for one, a, b in zip(*limits, strict=False))
-    box = ", ".join(told)
+    box = in_words(*trained.interface["environment"].values())
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     # A line at a time: what was driven before a crash is kept.
     with Path(path).open("x", encoding="utf-8", buffering=1) as file:

@@ -28,7 +28,7 @@ from sfkd_jax.experiment import data, identified, runs
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.models import physics
 from sfkd_jax.plants import Vehicle, check_step
-from sfkd_jax.ranges import imported
+from sfkd_jax.ranges import imported, in_words
 from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.settings import arguments, choose
 from sfkd_jax.training import descend, fit, multi_step_loss, planning_loss
@@ -37,9 +37,7 @@ from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
 SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
 PLANNING_BATCH, PLANNING_RATE = 512, 0.02
-"""Single steps in a batch, and learning rate, of what planners add to a step. 2560 at
-0.003 took five times as long to a loss a third larger (10 000 steps, kinematic car).
-"""
+"""Single steps in a batch, and learning rate, of what planners add to a step."""
 
 
 def check_settings(settings: Settings) -> None:
@@ -142,9 +140,8 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     _, model = policy.built(recorded)
     names = settings.environment.names or policy.FRICTION_AND_WIND
     if settings.environment.is_known and not settings.logs:
-        box = zip(names, dataset.env_low, dataset.env_high, strict=False)
-        ranges = (f"{name} from {low:g} to {high:g}" for name, low, high in box)
-        store.print_message(f"the model reads e: {', '.join(ranges)}")
+        box = in_words(names, dataset.env_low, dataset.env_high)
+        store.print_message(f"the model reads e: {box}")
     loss = multi_step_loss(model, space, **arguments(options.loss, multi_step_loss))
     # Fixed windows: validation losses at different steps are comparable.
     held_out = spread_windows(dataset.validation, length=options.window)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sfkd_jax.models._networks import SMALL, Free, Sandwich, Weights, bounded
 from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
@@ -203,39 +203,38 @@ class Learned(nn.Module):
         them would be a hundred times as many numbers as a product of ψ and u.
         """
 
-        def tables(column: Int[Array, ""]) -> tuple[Array, ...]:
-            def weights(head: nn.Dense) -> Array:
-                own = head.variables["params"]
-                return jnp.vstack([own["kernel"], own["bias"]])[column]
+        def weights(head: nn.Dense) -> Array:
+            own = head.variables["params"]
+            return jnp.vstack([own["kernel"], own["bias"]])
 
-            return self._tables(weights)
-
-        # The tables are linear in the outputs of the heads, hence in their weights.
-        parts = jax.vmap(tables, out_axes=1)(jnp.arange(self.embedding + 1))
+        # A table is linear in the outputs of the heads, hence in their weights.
+        parts = (jnp.moveaxis(table, 0, 1) for table in self._tables(weights))
         return tuple(part.reshape(part.shape[0], -1) for part in parts)
 
     def _tables(self, read: Callable[[nn.Dense], Array]) -> tuple[Array, ...]:
         """Return [gain, offset] of the biases before a tanh, and of the others."""
 
         def table(head: nn.Dense) -> Array:
-            return read(head).reshape(-1, self.control + 1)
+            outputs = read(head)
+            return outputs.reshape(*outputs.shape[:-1], -1, self.control + 1)
 
-        B = read(self.input_head).reshape(self.rank, self.control)
-        outer = [jnp.pad(B, ((0, 0), (0, 1)))]
-        hidden = [outer[0][:0]]
+        B = read(self.input_head)
+        B = B.reshape(*B.shape[:-1], self.rank, self.control)
+        outer = [jnp.concatenate([B, jnp.zeros_like(B[..., :1])], axis=-1)]
+        hidden = [outer[0][..., :0, :]]
         if self.kind is not None:
             rows = table(self.residual_head)
-            hidden.append(rows[: -self.rank])
-            outer[0] += rows[-self.rank :]
+            hidden.append(rows[..., : -self.rank, :])
+            outer[0] += rows[..., -self.rank :, :]
         if self.pose:
             rows = table(self.decoder_head)
-            hidden.append(rows[:-3])
-            outer.append(rows[-3:])
+            hidden.append(rows[..., :-3, :])
+            outer.append(rows[..., -3:, :])
         if self.forcing_hidden:
             hidden.append(table(self.forcing_head))
         if self.scheduled:
             outer.append(table(self.mixture_head))
-        return jnp.concatenate(hidden), jnp.concatenate(outer)
+        return jnp.concatenate(hidden, axis=-2), jnp.concatenate(outer, axis=-2)
 
 
 def _couplings(

@@ -316,11 +316,8 @@ class PlanningModel(LatentModel):
 
     def model(self) -> Model:
         """Return the functions of F + g, of which nothing is known."""
-        return (
-            super()
-            .model()
-            ._replace(on_road=self.on_road, fitting=Fitting(), structure=Structure())
-        )
+        own: Any = {"on_road": self.on_road, "structure": Structure()}
+        return super().model()._replace(fitting=Fitting(), **own)
 
     def on_road(self, fiber: SfkdFiber, road: Control) -> SfkdFiber:
         """Return the fiber of F that steps like F + g where κ and v_ref are these."""
@@ -460,7 +457,7 @@ def sfkd(
     correction = None
     if planning_residual:
         layers = [nn.Dense(PLANNING_WIDTH), nn.tanh, nn.Dense(PLANNING_WIDTH), nn.tanh]
-        # Zeros: planners begin with the certified model, bit for bit.
+        # Zeros: planners begin with the certified model.
         out, zeros = rank * (rank + FREE + 1), nn.initializers.zeros
         correction = nn.Sequential([*layers, nn.Dense(out, kernel_init=zeros)])
     fields = space, learned, encoder, environment, correction, soft_penalty, beta
