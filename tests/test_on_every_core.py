@@ -64,12 +64,12 @@ pytestmark = pytest.mark.skipif(
 @pytest.mark.parametrize("stop", [signal.SIGINT])
 def test_stopping_it_stops_every_process(tmp_path, stop):
     """A job in the background ignores Ctrl-C; two runs of it would share their cells."""
-    script = started(tmp_path, sleep=60)
-    end = time.monotonic() + 20
+    script = started(tmp_path, sleep=600)
+    end = time.monotonic() + 120
     while len(shares(tmp_path)) < 2 and time.monotonic() < end:
         time.sleep(0.05)
     (os.killpg if stop == signal.SIGINT else os.kill)(script.pid, stop)
-    script.wait(timeout=20)
+    script.wait(timeout=120)
     assert script.returncode == 130
     assert len(shares(tmp_path)) == 2
     assert not [pid for pid in shares(tmp_path) if is_running(pid)]
@@ -79,7 +79,7 @@ def test_stopping_it_stops_every_process(tmp_path, stop):
 @pytest.mark.parametrize(("status", "collects"), [(0, True), (1, False)])
 def test_a_process_that_fails_is_not_passed_over(tmp_path, status, collects):
     script = started(tmp_path, status=status)
-    _, said = script.communicate(timeout=20)
+    _, said = script.communicate(timeout=120)
     assert script.returncode == status
     assert (tmp_path / "collected").exists() == collects
     assert ("the same command continues" in said) == bool(status)
