@@ -54,6 +54,21 @@ def condense(results):
     }
 
 
+def with_rows_before(old, new):
+    """The rows of an unfinished comparison and those that were driven since.
+
+    Both are of one seed, so of the same roads, winds, sensor noise and random keys.
+    """
+
+    def key(row):
+        return tuple(row[n] for n in ("row", "vehicle", "scenario", "controller"))
+
+    driven = {key(row) for row in new["rows"]}
+    rows = [row for row in old["rows"] if key(row) not in driven]
+    commits = sorted({*old["commits"], *new["commits"]})
+    return new | {"commits": commits, "rows": rows + new["rows"]}
+
+
 def _row(row):
     """One line: who drove where, every episode's RMSE [mm] by training, extremes."""
     seeds = row["seeds"]
@@ -134,8 +149,11 @@ def benchmark_table(name, scenarios, controllers):
             title = LABELS[label]
             if len(scenarios) > 1:
                 title = f"{scenario.upper()}: {title}"
-            cells = [cell(driven[car], rows["sfkd"][car]) for car in VEHICLES]
-            learned = driven["kinematic"]["parameters"] is not None
+            cells = [
+                cell(driven[car], rows["sfkd"][car]) if car in driven else "–"
+                for car in VEHICLES
+            ]
+            learned = any(row["parameters"] is not None for row in driven.values())
             trainings = min(len(row["seeds"]) for row in driven.values())
             lines.append([title, *cells, trainings if learned else "–"])
     return markdown(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
@@ -199,7 +217,10 @@ def main():
     folder = HOME.parent / "runs" / (given.run or given.name)
     results = json.loads((folder / "results.json").read_text("utf-8"))
     document = condense(results)
-    write(HOME / f"{given.name}.json", document, document.pop("rows"))
+    path = HOME / f"{given.name}.json"
+    if path.exists() and read(given.name)["seed"] == document["seed"]:
+        document = with_rows_before(read(given.name), document)
+    write(path, document, document.pop("rows"))
 
 
 if __name__ == "__main__":
