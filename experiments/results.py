@@ -36,6 +36,8 @@ LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
 }
 """Row of a comparison -> its name in a table, in the order of the tables."""
 LEVEL = 0.05
+BENCH3 = HOME / "bench3.jsonl"
+BENCH3_KEEPS = ("seeds", "alpha", "largest_mm", "left_the_lane", "rmse_mm", "p_holm")
 
 
 def condense(results):
@@ -54,19 +56,45 @@ def condense(results):
     }
 
 
-def with_rows_before(old, new):
-    """The rows of an unfinished comparison and those that were driven since.
+def add_to_bench3(results):
+    """Rows of sfkd-bench-3 driven since, in the place of the same rows before.
 
-    Both are of one seed, so of the same roads, winds, sensor noise and random keys.
+    Its cells take hours: they are driven in parts, and each is a line of its own.
     """
 
     def key(row):
-        return tuple(row[n] for n in ("row", "vehicle", "scenario", "controller"))
+        return row["row"], row["plant"], row["scenario"]
 
-    driven = {key(row) for row in new["rows"]}
-    rows = [row for row in old["rows"] if key(row) not in driven]
-    commits = sorted({*old["commits"], *new["commits"]})
-    return new | {"commits": commits, "rows": rows + new["rows"]}
+    rows = {key(row): row for row in read_lines(BENCH3)} if BENCH3.exists() else {}
+    rows |= {key(row): row for row in map(_bench3_row, results["rows"])}
+    for row in rows.values():
+        oracle = rows.get(("oracle", row["plant"], row["scenario"]))
+        row["minus_oracle_mm"] = oracle and round(difference(row, oracle)["mean"], 3)
+    lines = (json.dumps(row, ensure_ascii=False) for row in rows.values())
+    BENCH3.write_text("\n".join([*lines, ""]), "utf-8")
+
+
+def read_lines(path):
+    """The rows of a file with one line of JSON a row."""
+    return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+
+
+def _bench3_row(row):
+    """One line: row, plant and scenario, errors by training and episode [mm]."""
+    kept = _row(row)
+    name, errors = kept["row"], np.asarray(kept["rmse_mm"])
+    changed = re.search(r"num_samples=(\d+)", kept["controller"])
+    return {
+        "row": {"law": "law_learned", "law_plant": "law_true"}.get(name, name),
+        "frame": "path",
+        "plant": kept["vehicle"],
+        "scenario": kept["scenario"],
+        "samples": int(changed[1]) if changed else 1500,
+        "trainings": len(kept["seeds"]) if kept["parameters"] else 0,
+        "interval_mm": np.round(evaluation.mean_interval(errors)[1], 3).tolist(),
+        "commit": row["provenance"]["commit"],
+        **{name: kept[name] for name in BENCH3_KEEPS},
+    }
 
 
 def _row(row):
@@ -149,11 +177,8 @@ def benchmark_table(name, scenarios, controllers):
             title = LABELS[label]
             if len(scenarios) > 1:
                 title = f"{scenario.upper()}: {title}"
-            cells = [
-                cell(driven[car], rows["sfkd"][car]) if car in driven else "–"
-                for car in VEHICLES
-            ]
-            learned = any(row["parameters"] is not None for row in driven.values())
+            cells = [cell(driven[car], rows["sfkd"][car]) for car in VEHICLES]
+            learned = driven["kinematic"]["parameters"] is not None
             trainings = min(len(row["seeds"]) for row in driven.values())
             lines.append([title, *cells, trainings if learned else "–"])
     return markdown(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
@@ -216,11 +241,11 @@ def main():
     given = parser.parse_args()
     folder = HOME.parent / "runs" / (given.run or given.name)
     results = json.loads((folder / "results.json").read_text("utf-8"))
+    if given.name == "benchmark_path":
+        add_to_bench3(results)
+        return
     document = condense(results)
-    path = HOME / f"{given.name}.json"
-    if path.exists() and read(given.name)["seed"] == document["seed"]:
-        document = with_rows_before(read(given.name), document)
-    write(path, document, document.pop("rows"))
+    write(HOME / f"{given.name}.json", document, document.pop("rows"))
 
 
 if __name__ == "__main__":

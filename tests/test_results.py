@@ -59,7 +59,7 @@ def test_what_observing_the_environment_brings():
 
 @pytest.mark.parametrize(
     ("plant", "corridor", "error", "over_oracle"),
-    [("dynamic", 0.130, 7.0, 1.00), ("kinematic", 0.377, 13.1, 0.98)],
+    [("dynamic", 0.104, 6.9, 1.00), ("kinematic", 0.377, 13.1, 0.98)],
 )
 def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error, over_oracle):
     path = PRETRAINED / f"{plant}_path" / "certificate.json"
