@@ -61,7 +61,7 @@ class InnovationTest(NamedTuple):
         """Return the state before the first measurement."""
         size = self.deviation.shape[1]
         return InnovationState(
-            expected=jnp.full(size, jnp.nan),
+            expected=jnp.full(size, jnp.nan, dtype=float),
             level=jnp.zeros(()),
             means=jnp.zeros((len(WINDOWS), size)),
             alarm=jnp.asarray(False),
