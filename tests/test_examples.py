@@ -1,6 +1,7 @@
 """The examples run, and do what they say."""
 
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -192,3 +193,9 @@ def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_bl
     node.plan()
     assert node.sent[-1].drive.acceleration > -3.0
     assert float(node.progress) < 20.0
+
+
+def test_what_an_accelerator_is_measured_with_runs_without_one(tmp_path):
+    script = EXAMPLES.parent / "benchmarks" / "gpu.sh"
+    subprocess.run(["bash", script, "--small", f"root={tmp_path}", "speed"], check=True)
+    assert '"compilations": 1' in (tmp_path / "device.json").read_text()

@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# What to measure when an accelerator is at hand, in parts of at most ten minutes:
+#
+#     bash benchmarks/gpu.sh [--small] [root=DIR] controls|speed|train|table ...
+#
+# controls: those of the shipped policies, equal to the CPU's; speed: control steps, episodes at once; train: the main job; table: sfkd-bench-3,
+# which the same command continues. --small measures speed in seconds, to try the script without an accelerator.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+export PYTHONPATH=${PYTHONPATH:-src}:.
+# With factors of ten bits the controls are others, and no witness of a certificate holds.
+export JAX_DEFAULT_MATMUL_PRECISION=float32
+root=runs/device sizes=(--samples 1500 16384 --episodes 1024) parts=()
+for word in "$@"; do
+  case $word in
+    --small) sizes=(--cars dynamic --samples 16 --steps 5 --episodes 0) ;;
+    root=*) root=${word#root=} ;;
+    controls | speed | train | table) parts+=("$word") ;;
+    *) echo "no part $word; choose of controls, speed, train, table" >&2 && exit 2 ;;
+  esac
+done
+mkdir -p "$root"
+for part in "${parts[@]}"; do
+  case $part in
+    controls) python -m pytest -q tests/test_goldens.py ;;
+    speed) python -m benchmarks.device "${sizes[@]}" --out "$root/device.json" ;;
+    train) time python -m sfkd_jax.train +experiment=s3 root="$root" ;;
+    # 124: the time is up, and every cell that is done is kept.
+    table) timeout 580 python -m sfkd_jax.compare +experiment=benchmark_path root="$root" || [ $? = 124 ] ;;
+  esac
+done
