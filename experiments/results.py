@@ -57,10 +57,7 @@ def condense(results):
 
 
 def add_to_bench3(results):
-    """Rows of sfkd-bench-3 driven since, in the place of the same rows before.
-
-    Its cells take hours: they are driven in parts, and each is a line of its own.
-    """
+    """Rows of sfkd-bench-3, which is driven in parts, for those of before or beside."""
 
     def key(row):
         return row["row"], row["plant"], row["scenario"]
