@@ -62,7 +62,7 @@ def add_to_bench3(results):
     def key(row):
         return row["row"], row["plant"], row["scenario"]
 
-    rows = {key(row): row for row in read_lines(BENCH3)} if BENCH3.exists() else {}
+    rows = {key(row): row for row in bench3()} if BENCH3.exists() else {}
     rows |= {key(row): row for row in map(_bench3_row, results["rows"])}
     for row in rows.values():
         oracle = rows.get(("oracle", row["plant"], row["scenario"]))
@@ -71,9 +71,10 @@ def add_to_bench3(results):
     BENCH3.write_text("\n".join([*lines, ""]), "utf-8")
 
 
-def read_lines(path):
-    """The rows of a file with one line of JSON a row."""
-    return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+def bench3(name=""):
+    """Lines of sfkd-bench-3, of rows whose names begin like this."""
+    rows = map(json.loads, BENCH3.read_text("utf-8").splitlines())
+    return [row for row in rows if row["row"].startswith(name)]
 
 
 def _bench3_row(row):
