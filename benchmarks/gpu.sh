@@ -19,6 +19,7 @@ for word in "$@"; do
     *) echo "no part $word; choose of controls, speed, train, table" >&2 && exit 2 ;;
   esac
 done
+[ "${#parts[@]}" -gt 0 ] || { echo "no part given; choose of controls, speed, train, table" >&2 && exit 2; }
 mkdir -p "$root"
 for part in "${parts[@]}"; do
   case $part in
