@@ -72,9 +72,9 @@ def add_to_bench3(results):
 
 
 def bench3(name=""):
-    """Lines of sfkd-bench-3, of rows whose names begin like this."""
+    """Lines of sfkd-bench-3 whose "plant row" begins like this."""
     rows = map(json.loads, BENCH3.read_text("utf-8").splitlines())
-    return [row for row in rows if row["row"].startswith(name)]
+    return [row for row in rows if f"{row['plant']} {row['row']}".startswith(name)]
 
 
 def _bench3_row(row):
