@@ -71,10 +71,9 @@ def add_to_bench3(results):
     BENCH3.write_text("\n".join([*lines, ""]), "utf-8")
 
 
-def bench3(name=""):
-    """Lines of sfkd-bench-3 whose "plant row" begins like this."""
-    rows = map(json.loads, BENCH3.read_text("utf-8").splitlines())
-    return [row for row in rows if f"{row['plant']} {row['row']}".startswith(name)]
+def bench3():
+    """The lines of sfkd-bench-3."""
+    return [json.loads(line) for line in BENCH3.read_text("utf-8").splitlines()]
 
 
 def _bench3_row(row):
