@@ -23,9 +23,9 @@ from sfkd_jax.certification._core import (
 )
 from sfkd_jax.certification._weights import Exported, require, require_all
 
-COMPILATION_SLACK = 1.0 + 1e-6
-"""Slack for rounding: another compilation of the same model may serve explicit weights
-that differ relatively by about 1.5e-7 (measured).
+COMPILATION_SLACK = 1.0 + 1e-4
+"""Slack for rounding: another processor, or version of jax, serves other explicit
+weights; of some models by more than 1e-6, and their certificates were refused there.
 """
 OUTPUTS = ("position", "yaw")
 """Outputs with a metric of their own: e_y [m] and e_ψ [rad]."""

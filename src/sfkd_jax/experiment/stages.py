@@ -36,8 +36,10 @@ from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
-PLANNING_BATCH, PLANNING_RATE = 512, 0.02
-"""Single steps in a batch, and learning rate, of what planners add to a step."""
+PLANNING_BATCH, PLANNING_RATE, PLANNING_STEPS = 256, 0.01, 2
+"""Of what planners add to a step: single steps in a batch, learning rate, steps for one
+of the model.
+"""
 
 
 def check_settings(settings: Settings) -> None:
@@ -172,7 +174,7 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
             partial(random_windows, batch=PLANNING_BATCH, length=1),
             dataset.train,
             jax.random.fold_in(key, 1),
-            steps=options.steps,
+            steps=PLANNING_STEPS * options.steps,
             learning_rate=PLANNING_RATE,
         )
         params = {**params, "planning": added}
