@@ -27,7 +27,7 @@ NOISE, TEMPERATURE, EFFORT = 0.4, 1.0, 0.01
 LOW, HIGH = -2.0, 2.0
 SAMPLES, HORIZON, WARM_UP = 1500, 20, 9
 TARGET = np.zeros(OUTPUTS, np.float32)
-PACKAGES = ("jax", "torch", "pytorch_mppi", "jax_mppi", "evosax")
+PACKAGES = ("jax", "torch", "pytorch_mppi", "jax_mppi")
 
 
 def weights():
@@ -183,36 +183,6 @@ def jax_mppi():
     return stepping(act, first)
 
 
-def evosax_cma_es():
-    """evosax, one generation of CMA-ES a step, started anew around the shifted plan."""
-    import jax
-    import jax.numpy as jnp
-    from evosax.algorithms import CMA_ES
-
-    w, plan = on_device(), jnp.zeros((HORIZON, CONTROLS))
-    strategy = CMA_ES(population_size=SAMPLES, solution=plan)
-    params = strategy.default_params.replace(std_init=NOISE)
-
-    def rollout(z, target, controls):
-        def body(z, u):
-            z = advance(jnp, w, z, u)
-            return z, charge(jnp, w, z, u, target)
-
-        return jnp.sum(jax.lax.scan(body, z, controls)[1])
-
-    def act(memory, z, target):
-        key, plan = memory
-        key, begin, ask, tell = jax.random.split(key, 4)
-        plans, state = strategy.ask(ask, strategy.init(begin, plan, params), params)
-        plans = jnp.clip(plans, LOW, HIGH)
-        costs = jax.vmap(partial(rollout, z, target))(plans)
-        state, _ = strategy.tell(tell, plans, costs, state, params)
-        plan = jnp.clip(strategy.get_mean(state), LOW, HIGH)
-        return plan[0], (key, jnp.concatenate([plan[1:], plan[-1:]]))
-
-    return stepping(act, (jax.random.key(0), plan))
-
-
 def pytorch_mppi():
     """pytorch-mppi, eager, float32."""
     import pytorch_mppi as library
@@ -242,8 +212,7 @@ def pytorch_mppi():
 
 
 CONTENDERS = {
-    build.__name__: build
-    for build in (sfkd_jax, plain_jax, jax_mppi, evosax_cma_es, pytorch_mppi)
+    build.__name__: build for build in (sfkd_jax, plain_jax, jax_mppi, pytorch_mppi)
 }
 
 

@@ -1,6 +1,6 @@
 """Results in the repository: one JSON a benchmark, one line a row, and the tables of docs/results.md.
 
-    python -m experiments.results benchmark [RUN]    takes runs/RUN/results.json
+    python -m experiments.results benchmark [RUN]    takes runs/RUN/results.json; bench3 adds its rows
     python -m benchmarks.pages                       writes the tables
 
 A row keeps the lateral RMSE of every episode of every training, from which intervals are
@@ -11,6 +11,7 @@ import argparse
 import json
 import re
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from sfkd_jax.report import figures, style
 
 HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
-BENCHMARKS = ("benchmark", "benchmark_path", "table1", "figure2", "corridor")
+BENCHMARKS = ("benchmark", "table1", "figure2", "corridor")
 VEHICLES = {
     "kinematic": "kinematic",
     "kinematic_stiff": "stiff kinematic",
@@ -33,11 +34,28 @@ LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
     "icode_extrinsic": "ICODE, e extrinsic",
     "icode_mppi_extrinsic": "ICODE-MPPI, e extrinsic",
     "nominal": "Nominal bicycle",
+    "law_learned": "Law of the learned model alone",
+    "law_true": "Law of the true car alone",
+    "law_nominal": "Law of the bicycle alone",
+    "sfkd_alone": "SFKD without g",
 }
 """Row of a comparison -> its name in a table, in the order of the tables."""
 LEVEL = 0.05
 BENCH3 = HOME / "bench3.jsonl"
-BENCH3_KEEPS = ("seeds", "alpha", "largest_mm", "left_the_lane", "rmse_mm", "p_holm")
+PATH_ROWS = (
+    *("sfkd", "sfkd_alone", "sfkd_no_contraction"),
+    *("neural_ode", "icode", "control_synth", "nominal", "oracle"),
+    *("law_learned", "law_true", "law_nominal", "law_stanley", "law_pure_pursuit"),
+)
+BENCH3_KEEPS = (
+    "seeds",
+    "parameters",
+    "alpha",
+    "largest_mm",
+    "left_the_lane",
+    "rmse_mm",
+    "p_holm",
+)
 
 
 def condense(results):
@@ -58,11 +76,8 @@ def condense(results):
 
 def add_to_bench3(results):
     """Rows of sfkd-bench-3, which is driven in parts, for those of before or beside."""
-
-    def key(row):
-        return row["row"], row["plant"], row["scenario"]
-
-    rows = {key(row): row for row in bench3()} if BENCH3.exists() else {}
+    key = itemgetter("row", "plant", "scenario")
+    rows = {key(row): row for row in bench3()}
     rows |= {key(row): row for row in map(_bench3_row, results["rows"])}
     for row in rows.values():
         oracle = rows.get(("oracle", row["plant"], row["scenario"]))
@@ -74,6 +89,15 @@ def add_to_bench3(results):
 def bench3():
     """The lines of sfkd-bench-3."""
     return [json.loads(line) for line in BENCH3.read_text("utf-8").splitlines()]
+
+
+def bench3_of(scenario):
+    """Row -> plant -> its line on one scenario, in the order of the table."""
+    found = {label: {} for label in PATH_ROWS}
+    for row in bench3():
+        if row["scenario"] == scenario:
+            found[row["row"]][row["plant"]] = row
+    return {label: rows for label, rows in found.items() if rows}
 
 
 def _bench3_row(row):
@@ -150,7 +174,10 @@ def difference(row, reference):
 
 def cell(row, reference):
     """Mean and 95 % interval [mm]; † better, * worse than SFKD after Holm's correction."""
-    mean, (low, high) = evaluation.mean_interval(np.asarray(row["rmse_mm"]))
+    errors = np.asarray(row["rmse_mm"])
+    if left := row["left_the_lane"]:
+        return f"{left} of {errors.size} leave the lane"
+    mean, (low, high) = evaluation.mean_interval(errors)
     mark = ""
     if row["p_holm"] is not None and row["p_holm"] < LEVEL:
         mark = " \\*" if difference(row, reference)["mean"] > 0 else " †"
@@ -164,19 +191,24 @@ def markdown(heads, rows):
     return "\n".join(f"| {' | '.join(cells)} |" for cells in escaped)
 
 
-def benchmark_table(name, scenarios, controllers):
-    """Every row of sfkd-bench-2 on all plants; several scenarios below each other."""
+def plants_table(found):
+    """Every row on all plants.
+
+    Args:
+        found: text before a name -> row -> plant -> its results.
+    """
     lines = []
-    for scenario in scenarios:
-        rows = of_scenario(name, scenario, controllers)
+    for before, rows in found.items():
         for label, driven in rows.items():
-            title = LABELS[label]
-            if len(scenarios) > 1:
-                title = f"{scenario.upper()}: {title}"
-            cells = [cell(driven[car], rows["sfkd"][car]) for car in VEHICLES]
-            learned = driven["kinematic"]["parameters"] is not None
+            cells = [
+                cell(driven[car], rows["sfkd"][car]) if car in driven else "–"
+                for car in VEHICLES
+            ]
             trainings = min(len(row["seeds"]) for row in driven.values())
-            lines.append([title, *cells, trainings if learned else "–"])
+            learned = next(iter(driven.values()))["parameters"]
+            lines.append(
+                [before + LABELS[label], *cells, trainings if learned else "–"]
+            )
     return markdown(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
 
 
@@ -217,10 +249,11 @@ def draw_figure2():
     style.save(path, figures.side_forces, rows)
 
 
+BODY = partial(of_scenario, "benchmark", "s3", ("mppi", "koopman_mpc"))
 TABLES = {
-    "body": partial(benchmark_table, "benchmark", ("s3",), ("mppi", "koopman_mpc")),
-    "path": partial(
-        benchmark_table, "benchmark_path", ("s2", "s3"), ("mppi_path_300",)
+    "body": lambda: plants_table({"": BODY()}),
+    "path": lambda: plants_table(
+        {f"{s.upper()}: ": bench3_of(s) for s in ("s2", "s3")}
     ),
     "paper": paper_table,
 }
@@ -232,14 +265,13 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("name", choices=BENCHMARKS)
+    parser.add_argument("name", choices=(BENCH3.stem, *BENCHMARKS))
     parser.add_argument("run", nargs="?", help="folder below runs/; the same name")
     given = parser.parse_args()
     folder = HOME.parent / "runs" / (given.run or given.name)
     results = json.loads((folder / "results.json").read_text("utf-8"))
-    if given.name == "benchmark_path":
-        add_to_bench3(results)
-        return
+    if given.name == BENCH3.stem:
+        return add_to_bench3(results)
     document = condense(results)
     write(HOME / f"{given.name}.json", document, document.pop("rows"))
 

@@ -24,7 +24,7 @@ from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.scenarios import CAR, COURSES, Scenario
 from sfkd_jax.settings import arguments, choose, replace
-from sfkd_jax.types import Controller, Key
+from sfkd_jax.types import Controller, Key, Params
 
 
 class EpisodeSet(NamedTuple):
@@ -68,24 +68,25 @@ def make_episodes(settings: Settings) -> EpisodeSet:
 
 
 def _over_episodes(
-    run: Callable[[Scenario, Key], evaluation.Episode],
-) -> Callable[[Scenario, Key], evaluation.Episode]:
+    run: Callable[[Params, Scenario, Key], evaluation.Episode],
+) -> Callable[[Params, Scenario, Key], evaluation.Episode]:
     """Compile the simulation of one episode for a batch of them.
 
     Accelerators run all at once. On CPUs a core runs one episode after the other: the
     samples of a plan stay in its caches, and are too few to be divided among cores.
     """
+    # Weights are arguments: of constants every training would be compiled anew.
     if jax.default_backend() != "cpu":
-        return jax.jit(jax.vmap(run))
+        return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))
     compiled, cores = jax.jit(run), os.cpu_count() or 1
     # A process may be kept to some cores, as each of a comparison is.
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
 
-    def run_all(scenarios: Scenario, keys: Array) -> evaluation.Episode:
+    def run_all(params: Params, scenarios: Scenario, keys: Array) -> evaluation.Episode:
         count = len(keys)
         batch = [
-            jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys))
+            (params, *jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys)))
             for i in range(count)
         ]
         # Ahead of the threads, which would compile the same program side by side.
@@ -173,7 +174,6 @@ class SystemEvaluation:
             evaluation.simulate,
             plant.step,
             self.controller,
-            self.params,
             horizon=settings.controller.horizon,
             dt=plant.dt,
             observation_noise=settings.sensors(plant.state_names),
@@ -210,7 +210,7 @@ class SystemEvaluation:
             )
             envs = jax.jit(jax.vmap(disturb))(known.envs, episodes.keys)
             driven = known._replace(envs=envs)
-        episode = self._simulate(driven, episodes.keys)
+        episode = self._simulate(self.params, driven, episodes.keys)
         return episode, evaluation.score(episode, dt=self._plant.dt)
 
 

@@ -37,9 +37,7 @@ from sfkd_jax.types import BODY, Model, Params, Space, Trajectory
 SCORED_SCENARIOS = ("uniform", "wet")
 """Of the validation runs that trainings are compared on: S3 stays unseen."""
 PLANNING_BATCH, PLANNING_RATE, PLANNING_STEPS = 256, 0.01, 2
-"""Of what planners add to a step: single steps in a batch, learning rate, steps for one
-of the model.
-"""
+"""Of g: single steps in a batch, learning rate, and steps for each of the model's."""
 
 
 def check_settings(settings: Settings) -> None:
