@@ -119,21 +119,22 @@ def main():
     asked = arguments(
         __doc__, __file__, cars=CARS, samples=[1500], steps=200, episodes=16, seed=2026
     )
-    device, policies = jax.devices()[0].device_kind, {}
+    device = jax.devices()[0].device_kind
     for name in asked.cars:
         steps = {
             str(samples): control_step(name, samples, asked.steps)
             for samples in asked.samples
         }
-        policies[f"{name}_path"] = found = {"control_step": steps}
+        found = {"control_step": steps}
         if asked.episodes:
             found["s3"] = episodes(name, asked.samples[0], asked.episodes, asked.seed)
         print(name, json.dumps(found), flush=True)
-    # One file for all devices: the others' measurements stay.
-    known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
-    measured = {"jax": jax.__version__, "policies": policies}
-    known.setdefault("devices", {})[device] = measured
-    asked.out.write_text(json.dumps(known, indent=1) + "\n")
+        # One file for all devices and cars: what was measured before stays.
+        known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+        about = known.setdefault("devices", {}).setdefault(device, {})
+        about["jax"] = jax.__version__
+        about.setdefault("policies", {})[f"{name}_path"] = found
+        asked.out.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":

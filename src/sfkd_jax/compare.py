@@ -15,8 +15,7 @@ from sfkd_jax.report.comparison import write_results_page
 def run(settings: Settings) -> dict[str, Any]:
     """Evaluate all cells that are not done, then collect, compare and draw all rows.
 
-    With `comparison.share` only this share of the rows is evaluated, and nothing is
-    collected.
+    With `comparison.share` this share of the rows is evaluated, and none collected.
     """
     began, table = time.perf_counter(), Comparison(settings)
     done = table.evaluate()

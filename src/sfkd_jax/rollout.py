@@ -117,6 +117,23 @@ def with_offset(model: Model) -> Model:
     )
 
 
+def reencoded(model: Model) -> Model:
+    """Return the model of the state x⁺ = D F(Φ(x)): lifted anew for every step.
+
+    Errors of z that no state has do not last in its rollouts. It has no proof.
+    """
+
+    def step(fiber: Fiber, state: State, control: Control) -> State:
+        after = model.step(fiber, model.encode(fiber, state), control)
+        return model.decode(fiber, after)
+
+    def last(*inputs: Any) -> State:
+        return inputs[-1]
+
+    same = dict.fromkeys(("encode", "decode", "transport", "observe", "vector"), last)
+    return model._replace(step=step, structure=Structure(), **same)
+
+
 def runge_kutta(derivative: Callable[[State], State], state: State, dt: float) -> State:
     """Return the state after dt by one classical Runge-Kutta step, error O(dt⁴)."""
     k1 = derivative(state)
@@ -195,9 +212,7 @@ def state_errors(
 
     Position along and across the true heading [m], yaw wrapped [rad], body state.
     """
-    # In the true heading, so that along and across mean the same everywhere.
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
-    # Wrapped: a car that has turned around is not 2π away from itself.
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
     return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
 
@@ -205,8 +220,7 @@ def state_errors(
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     """Map a function over the leading axis, `size` items at a time.
 
-    The last batch is padded and the padding dropped: `jax.lax.map` would compile a
-    second program for the rest.
+    The last batch is padded: `jax.lax.map` would compile a second program for it.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     if count <= size:

@@ -115,8 +115,7 @@ class Declared:
 class Explicit(NamedTuple):
     """The plain weights of a discrete-time model; a certificate is about these.
 
-    z⁺ = A(e) z + B(e) u + W_L σ(… σ(W_1 z + b_1(u, e)) …) + b_L(u, e), σ with slopes in
-    [0, 1].
+    z⁺ = A(e) z + B(e) u + W_L σ(… σ(W_1 z + b_1(u, e)) …) + b_L(u, e), 0 ≤ σ' ≤ 1.
 
     Attributes:
         operators: what is known of A(e) for all e.

@@ -25,7 +25,7 @@ from helpers import (
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
 from sfkd_jax.models.sfkd import RESIDUALS
-from sfkd_jax.rollout import fold, rollout
+from sfkd_jax.rollout import fold, reencoded, rollout
 from sfkd_jax.types import POSE, Structure, Trajectory
 
 EVERY = (*VARIANTS, *OTHERS, *PHYSICS)
@@ -199,6 +199,20 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
     excess = np.linalg.norm(np.asarray(slope, np.float64), 2) - 0.1
     assert excess > 0
     np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["sfkd", "state"])
+def test_a_reencoded_rollout_goes_on_from_its_states(name, one):
+    """One of a latent does not, unless the latent is the state."""
+    model, params = model_and_params(name)
+    assert reencoded(model).structure == Structure()
+    steady = one._replace(envs=jnp.tile(one.envs[:1], (len(one.envs), 1)))
+    for each, goes_on in ((reencoded(model), True), (model, name == "state")):
+        roll = jit(partial(rollout, each))
+        whole = roll(params, steady)[0]
+        later = jax.tree.map(lambda leaf: leaf[1:], steady._replace(states=whole))
+        rest = roll(params, later._replace(states=whole))[0]
+        assert np.allclose(rest, whole[1:], atol=1e-5) == goes_on
 
 
 @pytest.mark.parametrize("name", ["path", "state"])

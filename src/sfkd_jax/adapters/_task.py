@@ -90,8 +90,7 @@ class DrivingTask:
                                   frame, one per sampling period at the speed
                                   to hold                                    4 · preview
 
-    An action lies in [-1, 1] and is clipped to it; u = u_low + (u_high − u_low)(a +
-    1)/2.
+    An action is clipped to [-1, 1]; u = u_low + (u_high − u_low)(a + 1)/2.
 
     Attributes:
         vehicle: "kinematic", "dynamic", or a plant.

@@ -160,8 +160,7 @@ def propose_metric(
 
     The variables are L with P = L L' and the multipliers of every vertex. In
     coordinates L'z the step has A' = L'A L'⁻¹, W_1' = W_1 L'⁻¹ and W_L' = L'W_L. The
-    Schur complement of the hidden layers gives α² as a largest eigenvalue, which is
-    differentiable.
+    Schur complement of the hidden layers gives α² as a differentiable eigenvalue.
 
     `rows` is C, `gaps` are d of the worst steps of every run, not of the calibration
     split. The search starts at `start`, the Lyapunov matrix of the operators, or at I.

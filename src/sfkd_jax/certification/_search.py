@@ -105,8 +105,7 @@ def lipschitz_upper(
 ) -> tuple[float, list[Vector]]:
     """Return the smallest Lipschitz bound that scaled multipliers prove, or infinity.
 
-    The network W_1 … W_L has slopes in [0, 1]; with `linear` the bound is on A z plus
-    the network.
+    The network W_1 … W_L has slopes in [0, 1]; with `linear` A z is added to it.
     """
     if not multipliers and len(weights) <= 1:
         given = (part for part in (*weights, linear) if part is not None)

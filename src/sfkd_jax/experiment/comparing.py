@@ -45,8 +45,7 @@ class Cell(NamedTuple):
 def list_cells(comparison: ComparisonSettings) -> list[Cell]:
     """Return all cells in the order of evaluation; those of one system are adjacent.
 
-    Every row is evaluated from one seed before any from the next, so that a table that
-    was interrupted still compares all rows.
+    Seed by seed, so that a table that was interrupted still compares all rows.
     """
     rows, seeds = comparison.rows, comparison.seeds
     for name in ("only", "one_seed"):

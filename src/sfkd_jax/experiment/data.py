@@ -354,8 +354,7 @@ def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory
     """Return the trajectories on which coverage is measured, by name.
 
     These are the test part, its segments of each scenario, and as many runs of S3,
-    which training never uses. Logged runs have no scenario: of them it is the test part
-    only.
+    which training never uses. Of logged runs, without scenarios, it is the test part.
     """
     parts = {"test": dataset.test}
     if dataset.scenarios is None:

@@ -72,8 +72,8 @@ def _over_episodes(
 ) -> Callable[[Params, Scenario, Key], evaluation.Episode]:
     """Compile the simulation of one episode for a batch of them.
 
-    Accelerators run all at once. On CPUs a core runs one episode after the other: the
-    samples of a plan stay in its caches, and are too few to be divided among cores.
+    Accelerators run all at once. A core runs one after the other, so that the samples
+    of a plan stay in its caches.
     """
     # Weights are arguments: of constants every training would be compiled anew.
     if jax.default_backend() != "cpu":

@@ -173,8 +173,7 @@ def flat_programs(
         act: (state leaves, observation, env, *ahead)
              -> (control, state leaves, info leaves)
 
-    Names are paths, such as `state.plan` and `info.cost`. Keys are passed as their
-    uint32 data.
+    Names are paths, such as `state.plan` and `info.cost`. Keys are uint32 data.
 
     Args:
         trained: the policy.

@@ -29,8 +29,7 @@ def own(
 
     Without a step a model of the vehicle can be learned and planned with, but the
     vehicle cannot be simulated. Its nominal model is the textbook kinematic bicycle on
-    (p_x, p_y, yaw, v), with the centre of mass in the middle; further states are
-    constant.
+    (p_x, p_y, yaw, v), centre of mass in the middle; further states are constant.
 
     Args:
         dt: sampling period [s].

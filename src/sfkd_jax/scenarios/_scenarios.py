@@ -143,8 +143,7 @@ def smooth_path(
 
         κ(s) = Σᵢ aᵢ sin(2π s/λᵢ + φᵢ),   max |κ| = κ_max
 
-    The curvature is blended in over the first metres, so that an episode starts on the
-    path.
+    It is blended in over the first metres, so that an episode starts on the path.
 
     Args:
         key: consumed.

@@ -194,9 +194,8 @@ def derive_path_law(
     F is the vehicle's step in path coordinates, see `geometry.path_step`; K solves
     the Riccati equation of F linearised at ξ*. Derivatives are finite differences, so
     the step may be any function, such as a simulator on the host. Newton's method
-    starts every turn from that of the next smaller |κ|. If it does not converge (the
-    circle is too fast for the friction), the turn and gain of the smaller curvature are
-    used.
+    starts every turn from that of the next smaller |κ|. If it does not converge (too
+    fast for the friction), the turn and gain of the smaller curvature are used.
 
     Args:
         step: (x, u, e) -> x one sampling period later.

@@ -89,8 +89,7 @@ class SteadyTurn(NamedTuple):
     def authority(self, coordinates: PathState) -> Scalar:
         """Return the share of a planner's perturbation that acts, 1 near the path.
 
-        A U-turn leads away from the path for longer than a horizon: a planner would
-        rather park.
+        A U-turn takes longer than a horizon: a planner would rather park.
         """
         _, astray, far, _ = course(self, coordinates - self.state)
         return 1.0 - far * astray

@@ -50,8 +50,7 @@ class Mppi(SamplingPlanner):
         shrinkage: whether the mean moves away from the plan only as far as its variance
             lets it, see `shrunk`: few samples then do no harm.
 
-    Source: Williams et al. (2018), Information-Theoretic Model Predictive Control, T-RO
-    34(6).
+    Source: Williams et al. (2018), Information-Theoretic MPC, T-RO 34(6).
     """
 
     temperature: Positive = 5.0
@@ -165,8 +164,7 @@ def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
     """Return λ at which `effective_sample_size` is `wanted`, by bisection of log λ.
 
     The bracket scales with the range of the finite costs, so λ scales with the costs.
-    If no λ gives `wanted`, the result is an end of the bracket. Derivatives take λ as
-    a constant.
+    If no λ gives `wanted`, the result is an end of it. Derivatives take λ as constant.
     """
     costs = jax.lax.stop_gradient(costs)
     finite = jnp.isfinite(costs)

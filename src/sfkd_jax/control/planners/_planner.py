@@ -301,8 +301,7 @@ def iterate(
 def tuned(state: Memory, **changes: Any) -> Memory:
     """Return the state with other entries of `Tuning`, of the types that it has.
 
-    A plain number in their place would be of a weaker type, and compile the planner
-    again.
+    A plain number would be of a weaker type, and compile the planner again.
 
     Args:
         state: of a controller, in which a planner's is found however deep it lies.

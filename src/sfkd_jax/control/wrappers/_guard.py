@@ -2,8 +2,7 @@
 
 Everything that decides whether the planner's control may pass is here. In one control
 step (`Shield.act`) the measurement, which passed the `Gate`, is compared with the
-nominal model (`Shield._compare`), the request is filtered (`safety_filter`), and both
-are reported.
+nominal model (`Shield._compare`), and the request is filtered (`safety_filter`).
 """
 
 from __future__ import annotations

@@ -201,8 +201,7 @@ class LatentModel:
     def _terms(self, fiber: SfkdFiber, control: Control) -> tuple[Any, Any, Any]:
         """Return A and the biases of residual and decoder: every function of u and e.
 
-        The residual's last bias includes B(e) u + f(u, e). No Lipschitz bound in z sees
-        a bias.
+        The residual's last bias includes B(e) u + f(u, e). No bound in z sees a bias.
         """
         if fiber.bilinear is None:
             hidden, outer = _moved(fiber.local.gains, fiber.local.offsets, control)
@@ -390,9 +389,8 @@ def sfkd(
         decoder_hidden: hidden widths of D.
         encoder_hidden: hidden width of φ.
         linear_lift: whether φ contains W_0 s, see `Encoder`.
-        lift: "network" is φ; "state" is z = C⁻¹ (s − c), the state in coordinates in
-            which a step contracts: a rollout is then lifted anew at every step, and
-            the error of a step is that of the state alone.
+        lift: "network" is φ; "state" is z = C⁻¹ (s − c), coordinates in which a step
+            contracts: its error is then that of the state alone.
         embedding: size of ψ(e).
         frame: "body" composes the pose on SE(2) outside z; "path" has path coordinates
             as body (see `geometry`) and no pose.
