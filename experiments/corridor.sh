@@ -3,10 +3,9 @@
 # What ships in src/sfkd_jax/pretrained/*_path was made by this. Extra arguments are Hydra overrides.
 set -euo pipefail
 for vehicle in dynamic kinematic; do
-  # Its steering saturates on ice: more operators; its policy ships with the law and the loss of before.
-  [ "$vehicle" = dynamic ] && own=() ||
-    own=(model.vertices=12 dataset.law.lateral=10 dataset.law.heading=60 'training.loss.tube=[0.06]' training.steps=10000)
-  run=(+experiment=s3 vehicle="$vehicle" name="corridor_$vehicle" dataset.segments=16000 training.steps=20000 "${own[@]}"
+  # Its steering saturates on ice: more operators, more data.
+  [ "$vehicle" = dynamic ] && own=(dataset.segments=16000) || own=(dataset.segments=64000 model.vertices=12)
+  run=(+experiment=s3 vehicle="$vehicle" name="corridor_$vehicle" training.steps=20000 "${own[@]}"
     certification.corridor.runs=300 certification.corridor.attack_steps=1000000 evaluation.episodes=16 "$@")
   python -m sfkd_jax.certify "${run[@]}"
   python -m sfkd_jax.evaluate "${run[@]}" controller=mppi_path_300
