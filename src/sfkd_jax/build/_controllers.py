@@ -207,13 +207,12 @@ def build_controller(
     )
     own = {**box, **arguments(settings.own, factory)}
     # Here and nowhere else: what guards the planner has the model that is certified.
-    rolled = model.planning or model
+    again = isinstance(settings, SearchSettings) and settings.reencode
+    rolled = reencoded(model) if again else model.planning or model
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
     # Whoever estimates e learns the unmeasured forces with the same filter.
     estimates = env_source == "estimated"
-    if searches is not None and searches.reencode:
-        rolled = reencoded(rolled)
     adaptive |= estimates or (searches is not None and searches.adaptive)
     if not model.along_path:
         if adaptive:
