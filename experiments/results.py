@@ -76,11 +76,11 @@ def condense(results):
 
 def add_to_bench3(results):
     """Rows of sfkd-bench-3, which is driven in parts, for those of before or beside."""
-    key = itemgetter("row", "plant", "scenario")
+    key = itemgetter("row", "frame", "plant", "scenario")
     rows = {key(row): row for row in bench3()}
     rows |= {key(row): row for row in map(_bench3_row, results["rows"])}
     for row in rows.values():
-        oracle = rows.get(("oracle", row["plant"], row["scenario"]))
+        oracle = rows.get(("oracle", row["frame"], row["plant"], row["scenario"]))
         row["minus_oracle_mm"] = oracle and round(difference(row, oracle)["mean"], 3)
     lines = (json.dumps(row, ensure_ascii=False) for row in rows.values())
     BENCH3.write_text("\n".join([*lines, ""]), "utf-8")
@@ -95,7 +95,7 @@ def bench3_of(scenario):
     """Row -> plant -> its line on one scenario, in the order of the table."""
     found = {label: {} for label in PATH_ROWS}
     for row in bench3():
-        if row["scenario"] == scenario:
+        if (row["frame"], row["scenario"]) == ("path", scenario):
             found[row["row"]][row["plant"]] = row
     return {label: rows for label, rows in found.items() if rows}
 
@@ -106,7 +106,7 @@ def _bench3_row(row):
     name, errors = kept["row"], np.asarray(kept["rmse_mm"])
     return {
         "row": {"law": "law_learned", "law_plant": "law_true"}.get(name, name),
-        "frame": "path",
+        "frame": "path" if "path" in kept["controller"] else "body",
         "plant": kept["vehicle"],
         "scenario": kept["scenario"],
         "samples": 1 if name.startswith("law") else 1500,
