@@ -201,7 +201,7 @@ def plants_table(found):
     for before, rows in found.items():
         for label, driven in rows.items():
             cells = [
-                cell(driven[car], rows["sfkd"][car]) if car in driven else "–"
+                cell(driven[car], rows["sfkd"].get(car)) if car in driven else "–"
                 for car in VEHICLES
             ]
             trainings = min(len(row["seeds"]) for row in driven.values())
