@@ -91,13 +91,13 @@ def bench3():
     return [json.loads(line) for line in BENCH3.read_text("utf-8").splitlines()]
 
 
-def bench3_of(scenario):
-    """Row -> plant -> its line on one scenario, in the order of the table."""
+def along_path():
+    """Row -> (plant, scenario) -> its line, in the order of the table."""
     found = {label: {} for label in PATH_ROWS}
     for row in bench3():
-        if (row["frame"], row["scenario"]) == ("path", scenario):
-            found[row["row"]][row["plant"]] = row
-    return {label: rows for label, rows in found.items() if rows}
+        if row["frame"] == "path":
+            found[row["row"]][row["plant"], row["scenario"]] = row
+    return found
 
 
 def _bench3_row(row):
@@ -191,25 +191,19 @@ def markdown(heads, rows):
     return "\n".join(f"| {' | '.join(cells)} |" for cells in escaped)
 
 
-def plants_table(found):
-    """Every row on all plants.
-
-    Args:
-        found: text before a name -> row -> plant -> its results.
-    """
+def systems_table(rows, columns):
+    """Errors with intervals: row -> column -> results, and column -> its head."""
     lines = []
-    for before, rows in found.items():
-        for label, driven in rows.items():
-            cells = [
-                cell(driven[car], rows["sfkd"].get(car)) if car in driven else "–"
-                for car in VEHICLES
-            ]
-            trainings = min(len(row["seeds"]) for row in driven.values())
-            learned = next(iter(driven.values()))["parameters"]
-            lines.append(
-                [before + LABELS[label], *cells, trainings if learned else "–"]
-            )
-    return markdown(["lateral RMSE [mm]", *VEHICLES.values(), "trainings"], lines)
+    for label, driven in rows.items():
+        driven = {at: row for at, row in driven.items() if at in columns}
+        cells = [
+            cell(driven[at], rows["sfkd"][at]) if at in driven else "–"
+            for at in columns
+        ]
+        trainings = min(len(row["seeds"]) for row in driven.values())
+        learned = next(iter(driven.values()))["parameters"]
+        lines.append([LABELS[label], *cells, trainings if learned else "–"])
+    return markdown(["lateral RMSE [mm]", *columns.values(), "trainings"], lines)
 
 
 def paper_table():
@@ -250,11 +244,14 @@ def draw_figure2():
 
 
 BODY = partial(of_scenario, "benchmark", "s3", ("mppi", "koopman_mpc"))
+PLACES = {
+    (car, scenario): f"{car}, {scenario.upper()}"
+    for car in ("kinematic", "dynamic")
+    for scenario in ("s2", "s3")
+}
 TABLES = {
-    "body": lambda: plants_table({"": BODY()}),
-    "path": lambda: plants_table(
-        {f"{s.upper()}: ": bench3_of(s) for s in ("s2", "s3")}
-    ),
+    "body": lambda: systems_table(BODY(), VEHICLES),
+    "path": lambda: systems_table(along_path(), PLACES),
     "paper": paper_table,
 }
 """Place in docs/results.md -> its table."""

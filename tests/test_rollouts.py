@@ -1,6 +1,4 @@
-"""What a model does along a trajectory, where the answer is known: the true plant as a
-model.
-"""
+"""What a model does along a trajectory, where the answer is known."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,6 +1,4 @@
-"""A brax system as a plant: brax's own motion where nothing is changed, known motions
-where something is.
-"""
+"""A brax system as a plant: brax's own motion, and known motions where it is changed."""
 
 from functools import cache
 

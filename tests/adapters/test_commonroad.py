@@ -1,6 +1,4 @@
-"""CommonRoad's cars as plants: their own equations, grip, frames, the servo, and a run
-on a road.
-"""
+"""CommonRoad's cars as plants: their equations, grip, frames, the servo, and a run."""
 
 from functools import cache
 

@@ -1,6 +1,4 @@
-"""Recorded runs are read without loss, and implausible ones are refused in one line
-with their row.
-"""
+"""Recorded runs are read without loss, implausible ones refused in one line."""
 
 import re
 

@@ -1,6 +1,4 @@
-"""Generated driving: repeatable, obedient to the plant, exciting, and spread over the
-environment box.
-"""
+"""Generated driving: repeatable, obedient to the plant, exciting, all over the box."""
 
 from functools import partial
 

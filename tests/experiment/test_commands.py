@@ -1,6 +1,4 @@
-"""The commands in a row, as a user runs them: last line JSON, errors of one line,
-artefacts intact.
-"""
+"""The commands as a user runs them: last line JSON, one-line errors, artefacts intact."""
 
 import json
 import os

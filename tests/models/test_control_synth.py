@@ -1,6 +1,4 @@
-"""ControlSynth: its flow contracts at the given rate for all weights and inputs; inputs
-are only added.
-"""
+"""ControlSynth: its flow contracts at the given rate for all weights and inputs."""
 
 from functools import cache
 

@@ -1,6 +1,4 @@
-"""The certified tube in the loss: it equals its formula, in metres, and training can lower
-it.
-"""
+"""The certified tube in the loss equals its formula, in metres; training can lower it."""
 
 from functools import partial
 
