@@ -1,6 +1,7 @@
 """Models that must not be certified are refused, with the reason."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, certified, jit, model_and_params
 
+import sfkd_jax
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
+    _verification,
     certify,
 )
+from sfkd_jax.certification._weights import exported
 from sfkd_jax.types import Samples
 
 BOX = (ENV_LOW, ENV_HIGH)
@@ -73,9 +77,7 @@ def at_the_limit(name):
 
 
 def modulated(model):
-    """FiLM: the environment scales what the residual and the operator emit, which no
-    bias does.
-    """
+    """FiLM: the environment scales what residual and operator emit, as no bias does."""
 
     def step(fiber, latent, control):
         after = model.step(fiber, latent, control)
@@ -88,6 +90,22 @@ def test_a_step_that_is_not_what_it_declares_is_contradicted_by_the_attack():
     model, params = at_the_limit("sfkd")
     with pytest.raises(CertificateContradicted, match="the attack on the step reaches"):
         certify(modulated(model), params, BOX, attack_starts=1)
+
+
+@pytest.mark.parametrize("car", ["dynamic", "kinematic"])
+def test_certificates_that_ship_survive_other_roundings(car, monkeypatch):
+    random = np.random.default_rng(0)
+
+    def rounded(leaf):
+        drawn = 1.0 + 1e-6 * random.uniform(-1.0, 1.0, np.shape(leaf))
+        return leaf * drawn if isinstance(leaf, np.ndarray) else leaf
+
+    def served(*about):
+        return jax.tree.map(rounded, exported(*about))
+
+    monkeypatch.setattr(_verification, "exported", served)
+    home = Path(sfkd_jax.__file__).parent / "pretrained" / f"{car}_path"
+    assert sfkd_jax.load(home).certificate
 
 
 # --- attacks --------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from sfkd_jax.certification._claims import (
     keeps_metrics,
     require_box,
     require_claims,
+    with_room,
 )
 from sfkd_jax.certification._measured import (
     KINDS,
@@ -112,7 +113,7 @@ def certify(
     began = time.perf_counter()
     box = require_box("env_box", env_box).astype(float).tolist()
     weights = exported(model, params)
-    claims = prove(weights)
+    claims = prove(with_room(weights))
     require(
         claims.alpha <= 1.0 - MARGIN,  # refuses NaN as well
         f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}) "
@@ -195,7 +196,6 @@ def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
     # A model without explicit weights trains like any other, just without this log.
     except CertificationRefused:
         return {}
-    # Few iterations: an estimate at every checkpoint, not the certificate.
     alpha, _ = joint_bound(weights, weights.residual_multipliers, iterations=15)
     # JSON has no infinity: what is not proved is absent.
     return {"alpha": alpha} if np.isfinite(alpha) else {}
@@ -237,7 +237,7 @@ def issue(
     began = time.perf_counter()
     # First the proof: where it refuses, nothing need be measured.
     certificate = certify(model, params, boxes["env"], attack_starts=attack_starts)
-    weights, start = exported(model, params), None
+    weights, start = with_room(exported(model, params)), None
     try:
         claim = prove_lyapunov(weights)
         lyapunov, start = claim.document(), claim.metric

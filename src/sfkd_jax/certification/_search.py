@@ -38,7 +38,6 @@ INFEASIBLE = 1e3
 def prove(weights: Exported) -> Claims:
     """Search for the smallest constants that the core accepts, or refuse."""
     bound, start = _best_multipliers(weights.residual, weights.residual_multipliers)
-    # Another compilation may round the weights differently: the bound covers both.
     beta = COMPILATION_SLACK * bound
     unproved = "no multipliers prove a Lipschitz bound of the"
     require(np.isfinite(beta), f"{unproved} residual")
@@ -54,7 +53,6 @@ def prove(weights: Exported) -> Claims:
         bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
         lipschitz[name] = COMPILATION_SLACK * bound
     require(np.all(np.isfinite([*lipschitz.values()])), f"{unproved} decoder")
-    # The sum needs no search of its own, and is the fallback of the joint bound.
     separate = rho + beta
     return Claims(
         scope=hull_scope(weights),
@@ -81,7 +79,6 @@ def joint_bound(
         bound, start = lipschitz_upper(weights.residual, start, vertex)
         bounds.append(bound)
         witnesses.append(start)
-    # The worst vertex decides: e may be at any of them.
     return COMPILATION_SLACK * max(bounds), witnesses
 
 
@@ -170,7 +167,6 @@ def propose_multipliers(
         gradient = []
         for k, (before, here) in enumerate(pairwise([vectors, *hidden])):
             each = -2.0 * here * (here - weights[k] @ before)
-            # Chain rule through the exponential: dλ = λ d log λ.
             gradient.append(multipliers[k] * (each @ powers) / (largest * total))
         value = 0.5 * (np.log(largest) + np.log(total) / sharpness)
         return value, 0.5 * np.concatenate(gradient)
