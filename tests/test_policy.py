@@ -194,7 +194,7 @@ def test_a_planner_in_a_guard_sees_what_the_gate_believes():
         told = x + jnp.asarray(faults.get(k, [0.0] * 4))
         road = straight(20).at[:, 0].add(x[0])
         u, state, info = act(trained.params, state, told, ENV, road)
-        np.testing.assert_allclose(info["seen"], x, atol=0.1 * (k in faults))
+        np.testing.assert_allclose(info["seen"], x, atol=0.15 * (k in faults))
         x = trained.vehicle.step(x, u, ENV)
 
 
@@ -229,7 +229,7 @@ def test_a_policy_drives_on_earth_as_it_does_at_the_origin(vehicle):
             return np.concatenate([turned, points[..., 2:3] + yaw, points[..., 3:]], -1)
 
         x, state, errors = (
-            start(vehicle).at[1].set(0.5),
+            start(vehicle).at[1].set(0.25),
             trained.controller.init(KEY),
             [],
         )
