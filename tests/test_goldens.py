@@ -1,5 +1,5 @@
 """What ships does not change: controls of the policies along recorded episodes, and
-the acceptance of their certificates. Recorded at 91241cc, along a path 988cdc9 and cb43f3f.
+the acceptance of their certificates. Recorded at 91241cc, along a path with the planners of this commit.
 """
 
 from pathlib import Path

@@ -1,5 +1,6 @@
 """What a model does along a trajectory, where the answer is known."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def test_batches_of_any_size_leave_every_item_what_it_is_and_trace_one_program(s
         traced.append(item)
         return {"sum": item["a"].sum() + item["b"], "twice": 2.0 * item["a"]}
 
-    results = in_batches(function, items, size=size)
+    results = in_batches(jax.vmap(function), items, size=size)
     np.testing.assert_array_equal(results["sum"], items["a"].sum(axis=1) + items["b"])
     np.testing.assert_array_equal(results["twice"], 2.0 * items["a"])
     assert len(traced) == 1

@@ -117,23 +117,6 @@ def with_offset(model: Model) -> Model:
     )
 
 
-def reencoded(model: Model) -> Model:
-    """Return the model of the state x⁺ = D F(Φ(x)): lifted anew for every step.
-
-    Errors of z that no state has do not last in its rollouts. It has no proof.
-    """
-
-    def step(fiber: Fiber, state: State, control: Control) -> State:
-        after = model.step(fiber, model.encode(fiber, state), control)
-        return model.decode(fiber, after)
-
-    def last(*inputs: Any) -> State:
-        return inputs[-1]
-
-    same = dict.fromkeys(("encode", "decode", "transport", "observe", "vector"), last)
-    return model._replace(step=step, structure=Structure(), **same)
-
-
 def runge_kutta(derivative: Callable[[State], State], state: State, dt: float) -> State:
     """Return the state after dt by one classical Runge-Kutta step, error O(dt⁴)."""
     k1 = derivative(state)
@@ -218,20 +201,20 @@ def state_errors(
 
 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
-    """Map a function over the leading axis, `size` items at a time.
+    """Map a function of a batch over the leading axis, `size` items at a time.
 
     The last batch is padded: `jax.lax.map` would compile a second program for it.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     if count <= size:
-        return jax.vmap(function)(items)
+        return function(items)
 
     def batched(leaf: Array) -> Array:
         # Padding repeats the first items: real data, so that no NaN appears in it.
         padded = jnp.concatenate([leaf, leaf[: -count % size]])
         return padded.reshape(-1, size, *leaf.shape[1:])
 
-    results = jax.lax.map(jax.vmap(function), jax.tree.map(batched, items))
+    results = jax.lax.map(function, jax.tree.map(batched, items))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
 
 

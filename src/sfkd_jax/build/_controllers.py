@@ -9,7 +9,7 @@ import numpy as np
 
 from sfkd_jax import control, plants
 from sfkd_jax.geometry import CURVATURE, HEADING, LATERAL, PATH_SPEED, REFERENCE_SPEED
-from sfkd_jax.rollout import reencoded, with_offset
+from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller, Model
 
@@ -108,12 +108,10 @@ class SearchSettings(ControllerSettings):
     Attributes:
         shield: whether plans are kept inside the corridor of a certificate.
         adaptive: whether unmeasured forces are estimated while driving.
-        reencode: whether planners go back to the state after every predicted step.
     """
 
     shield: bool = False
     adaptive: bool = False
-    reencode: bool = False
     feedback: Any = None
     gate: Any = None
     adaptation: Any = None
@@ -207,8 +205,7 @@ def build_controller(
     )
     own = {**box, **arguments(settings.own, factory)}
     # Here and nowhere else: what guards the planner has the model that is certified.
-    again = isinstance(settings, SearchSettings) and settings.reencode
-    rolled = reencoded(model) if again else model.planning or model
+    rolled = model.planning or model
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     searches = settings if isinstance(settings, SearchSettings) else None
     # Whoever estimates e learns the unmeasured forces with the same filter.

@@ -239,7 +239,7 @@ def generate_open_loop(
         envs = jnp.tile(env, (steps, 1))
         return Trajectory(states[SETTLING - 1 :], controls[SETTLING:], envs)
 
-    return in_batches(one, jax.random.split(key, segments), size=BATCH)
+    return in_batches(jax.vmap(one), jax.random.split(key, segments), size=BATCH)
 
 
 def segment_scenarios(
@@ -437,7 +437,7 @@ def drive_along_path(
         return Trajectory(states[burn_in:], inputs[burn_in:], envs[burn_in:])
 
     keys = jax.random.split(key, envs.shape[0])
-    return in_batches(one, (envs, keys, groups), size=BATCH)
+    return in_batches(jax.vmap(one), (envs, keys, groups), size=BATCH)
 
 
 def _sensor_keys(key: Key, steps: int) -> Array:

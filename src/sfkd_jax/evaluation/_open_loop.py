@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,4 +40,4 @@ def open_loop(
         columns = [still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]
         return jnp.column_stack(columns) ** 2
 
-    return jnp.sqrt(jnp.mean(in_batches(squares, windows, size=128), axis=0))
+    return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))

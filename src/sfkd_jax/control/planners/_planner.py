@@ -273,14 +273,25 @@ class Planner(Stateful):
                 worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
             return after.sample, (after._replace(sample=None), worst)
 
-        def one(plan: Plan) -> Any:
-            return jax.lax.scan(body, setup.start, (plan, setup.targets, places))[1]
+        # Samples are the last axis throughout: of vectors of two or three entries a
+        # processor would use a fraction of its width.
+        every = jax.vmap(body, in_axes=(-1, (-1, None, None)), out_axes=-1)
+
+        def together(plans: Array) -> Any:
+            start = jax.tree.map(
+                lambda leaf: jnp.tile(leaf[..., None], plans.shape[0]), setup.start
+            )
+            steps = jnp.moveaxis(plans, 0, -1), setup.targets, places
+            return jax.tree.map(
+                lambda leaf: jnp.moveaxis(leaf, -1, 0),
+                jax.lax.scan(every, start, steps)[1],
+            )
 
         # Batches of one size.
         size = -(-plans.shape[1] // -(-plans.shape[1] // TOGETHER))
         along, worst = jax.tree.map(
             lambda leaf: jnp.swapaxes(leaf, 0, 1),
-            in_batches(one, jnp.swapaxes(plans, 0, 1), size=size),
+            in_batches(together, jnp.swapaxes(plans, 0, 1), size=size),
         )
         worst = None if worst is None else jnp.max(worst, axis=0)
         costs = jnp.sum(along.cost, axis=0)

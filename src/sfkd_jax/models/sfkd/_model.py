@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import compose
 from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich, apply
+from sfkd_jax.models._planning import Planning
 from sfkd_jax.models.sfkd._learned import (
     LOWEST_RATE,
     Learned,
@@ -42,10 +42,6 @@ from sfkd_jax.types import (
 )
 
 LIFTS = ("network", "state")
-FREE = 2
-"""Entries ν of a control along a path; κ and v_ref follow."""
-PLANNING_WIDTH, PLANNING_SCALE = 64, 0.01
-"""Of the network of `PlanningModel`, and of what it returns."""
 
 
 class PosedLatent(NamedTuple):
@@ -90,7 +86,6 @@ class SfkdFiber(NamedTuple):
     encoder: Any
     # Both tables of biases as forms of ψ and u, for training; else None.
     bilinear: tuple[Float[Array, "_ _"], ...] | None = None
-    planning: Any = None  # weights of g and the e that it reads, see `PlanningModel`
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +93,13 @@ class LatentModel:
     """The functions of `Model`.
 
     `learned` is all that is learned but the encoder, which is None where z is the
-    state, and `correction`, of `PlanningModel`; the last two are of `hinge`.
+    state; the last two are of `hinge`.
     """
 
     space: Space
     learned: Learned
     encoder: Encoder | None
     environment: bool
-    correction: nn.Sequential | None
     soft_penalty: float = 0.0
     beta: float = 0.0
 
@@ -120,11 +114,6 @@ class LatentModel:
         if self.encoder is not None:
             encoder = self.encoder.init(encoder_key, body, embedding)
             params["encoder"] = encoder["params"]
-        if self.correction is not None:
-            reads = jnp.zeros(self.learned.control - FREE + env.shape[0])
-            # Another stream: the others are drawn as without it.
-            added = self.correction.init(jax.random.fold_in(key, 2), reads)
-            params["planning"] = added["params"]
         return params
 
     def _apply(self, params: Params, method: str, *inputs: Array) -> Any:
@@ -290,58 +279,6 @@ class LatentModel:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class PlanningModel(LatentModel):
-    """F + g with g = M z + N ν + m along a path, for planners alone.
-
-    M, N and m are a network of κ, v_ref and e, which all samples of a plan share: it is
-    evaluated once a step, and g is added to weights of F, so that no sample costs more.
-    """
-
-    def fiber(self, params: Params, env: Environment) -> SfkdFiber:
-        """Return the fiber of F, with what g reads."""
-        reads = self.space.scaled_env(env, self.environment)
-        known = unfold(params)["planning"], reads
-        # `on_road` adds to gains and offsets.
-        return super().fiber(params, env)._replace(planning=known, bilinear=None)
-
-    def step(
-        self, fiber: SfkdFiber, latent: PosedLatent, control: Control
-    ) -> PosedLatent:
-        """Advance z by one sampling period."""
-        if fiber.planning is not None:
-            fiber = self.on_road(fiber, control[FREE:])
-        return super().step(fiber, latent, control)
-
-    def model(self) -> Model:
-        """Return the functions of F + g, of which nothing is known."""
-        own: Any = {"on_road": self.on_road, "structure": Structure()}
-        return super().model()._replace(fitting=Fitting(), **own)
-
-    def on_road(self, fiber: SfkdFiber, road: Control) -> SfkdFiber:
-        """Return the fiber of F that steps like F + g where κ and v_ref are these."""
-        weights, env = fiber.planning
-        mean, scale = self.space.control_mean, self.space.control_scale
-        reads = jnp.concatenate([(road - mean[FREE:]) / scale[FREE:], env])
-        assert self.correction is not None
-        table = cast(Array, self.correction.apply({"params": weights}, reads))
-        rank, A, local = fiber.readout.shape[1], fiber.A, fiber.local
-        table = PLANNING_SCALE * table.reshape(rank, -1)
-        M, N = table[:, :rank], table[:, rank:-1] / scale[:FREE]
-        m = table[:, -1] - N @ mean[:FREE]
-        # Weights of a mixture have the sum 1: what all have more, A(e, u) has more.
-        mixed = isinstance(A, Mixture)
-        A = A._replace(vertices=A.vertices + M) if mixed else A + M
-        (hidden, outer), (before, offset) = local.gains, local.offsets
-        # B(e) u comes first. Padded: a scatter takes as long as all samples do.
-        below = (0, outer.shape[0] - rank)
-        gains = hidden, outer + jnp.pad(N, (below, (0, outer.shape[1] - FREE)))
-        local = local._replace(
-            gains=gains, offsets=(before, offset + jnp.pad(m, below))
-        )
-        return fiber._replace(A=A, local=local, planning=None)
-
-
 def sfkd(
     space: Space,
     *,
@@ -406,15 +343,13 @@ def sfkd(
             none. It is no function of z, so every bound still holds.
         scheduled: let the mixture of the A_j read u as well as e: along a path its
             reference speed and curvature, on which the loop's dynamics depend most.
-        planning_residual: whether planners roll out F + g, with a residual g that no
-            certificate is about: F stays what is certified, guarded and compared with.
+        planning_residual: whether planners add to F a residual g that no certificate is
+            about, see `Planning`: F stays what is certified, guarded and compared with.
     """
     check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
     check_choice("model.budget", budget, BUDGETS)
     check_choice("model.lift", lift, LIFTS)
-    if planning_residual and frame != "path":
-        raise ValueError("model.planning_residual needs model.frame=path")
     kind = RESIDUALS[residual]
     state_lift = lift == "state"
     if state_lift:
@@ -452,15 +387,10 @@ def sfkd(
             f"model.rho + model.beta above {LOWEST_RATE}, got {rho + beta}"
         )
     encoder = None if state_lift else Encoder(rank, encoder_hidden, linear_lift)
-    correction = None
-    if planning_residual:
-        layers = [nn.Dense(PLANNING_WIDTH), nn.tanh, nn.Dense(PLANNING_WIDTH), nn.tanh]
-        # Zeros: planners begin with the certified model.
-        out, zeros = rank * (rank + FREE + 1), nn.initializers.zeros
-        correction = nn.Sequential([*layers, nn.Dense(out, kernel_init=zeros)])
-    fields = space, learned, encoder, environment, correction, soft_penalty, beta
-    planning = PlanningModel(*fields).model() if planning_residual else None
-    return LatentModel(*fields).model()._replace(planning=planning)
+    model = LatentModel(
+        space, learned, encoder, environment, soft_penalty, beta
+    ).model()
+    return Planning(model, space, environment).model() if planning_residual else model
 
 
 def _moved(
