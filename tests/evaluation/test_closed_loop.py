@@ -11,7 +11,7 @@ import pytest
 from helpers import at, jit, same
 
 from sfkd_jax import control, evaluation, models, plants, scenarios
-from sfkd_jax.evaluation import _closed_loop, disturbed_environment
+from sfkd_jax.evaluation import _loops, disturbed_environment
 from sfkd_jax.evaluation.metrics import SIGNALS
 from sfkd_jax.types import Controller
 
@@ -146,7 +146,7 @@ def test_two_systems_meet_the_same_sensor_noise_whatever_they_do_with_their_own_
 
 def test_no_key_is_used_twice_and_pushes_have_a_stream_of_their_own():
     road, key = at(roads(), 0), jax.random.key(4)
-    stream = jax.random.fold_in(key, _closed_loop.FORCE_STREAM)
+    stream = jax.random.fold_in(key, _loops.FORCE_STREAM)
     streams = [jax.random.key_data(k) for k in (stream, *jax.random.split(key))]
     assert len({tuple(np.asarray(data)) for data in streams}) == 3
     with jax.debug_key_reuse(True):

@@ -1,14 +1,14 @@
 """Closed-loop and open-loop evaluation: episodes, scores and their statistics."""
 
-from sfkd_jax.evaluation._closed_loop import Episode as Episode
-from sfkd_jax.evaluation._closed_loop import (
+from sfkd_jax.evaluation._loops import Episode as Episode
+from sfkd_jax.evaluation._loops import (
     disturbed_environment as disturbed_environment,
 )
-from sfkd_jax.evaluation._closed_loop import (
+from sfkd_jax.evaluation._loops import (
     observed_environment as observed_environment,
 )
-from sfkd_jax.evaluation._closed_loop import simulate as simulate
-from sfkd_jax.evaluation._open_loop import open_loop as open_loop
+from sfkd_jax.evaluation._loops import open_loop as open_loop
+from sfkd_jax.evaluation._loops import simulate as simulate
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores
 from sfkd_jax.evaluation._rows import compare as compare

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sfkd_jax.evaluation._closed_loop import Episode
+from sfkd_jax.evaluation._loops import Episode
 from sfkd_jax.evaluation._statistics import holm, paired_difference
 from sfkd_jax.evaluation.metrics import (
     METRICS,

@@ -1,4 +1,4 @@
-"""Closed-loop episodes in one scan, with imperfect sensors and unmeasured forces."""
+"""Episodes in closed loop, with imperfect sensors and side forces; open-loop errors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
-from sfkd_jax.geometry import LATERAL, curvature_ahead, path_coordinates
+from sfkd_jax.geometry import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    curvature_ahead,
+    path_coordinates,
+    wrap_angle,
+)
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
+from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors
 from sfkd_jax.scenarios import (
     Scenario,
     car_clearance,
@@ -22,7 +30,17 @@ from sfkd_jax.scenarios import (
     random_side_forces,
     reference_window,
 )
-from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+from sfkd_jax.types import (
+    BODY,
+    Controller,
+    Key,
+    Model,
+    Params,
+    Scalar,
+    State,
+    Step,
+    Trajectory,
+)
 
 FORCE_STREAM = 2
 SENSOR_STREAM = 3
@@ -200,3 +218,35 @@ def disturbed_environment(
     # A force is passed on as wind: plants have no other input from the side.
     wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
     return envs.at[:, 1].set(wind(envs[:, 1], force))
+
+
+def open_loop(
+    model: Model, params: Params, trajectories: Trajectory, *, horizon: int
+) -> Float[Array, "horizon 4"]:
+    """Return the RMSE of free-running predictions 1 … horizon steps ahead.
+
+    Predictions start at every `horizon`-th step of each trajectory.
+
+    Columns: along and across the true heading [m] (so that each axis means the same on
+    every trajectory), yaw [rad], speed [m/s]. In path coordinates: 0, e_y [m], e_ψ
+    [rad], speed [m/s].
+
+    Args:
+        model: that predicts.
+        params: of the model.
+        trajectories: held out from training.
+        horizon: steps.
+    """
+    windows = adjacent_windows(trajectories, length=horizon)
+
+    def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
+        predicted, true = rollout(model, params, window)[0], window.states[1:]
+        if not model.along_path:
+            return state_errors(predicted, true)[:, :4] ** 2
+        gap = (predicted - true)[:, BODY]
+        # Along a path nothing is predicted of the way along it.
+        still, yaw = jnp.zeros(gap.shape[0]), wrap_angle(gap[:, HEADING])
+        columns = [still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]
+        return jnp.column_stack(columns) ** 2
+
+    return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))
