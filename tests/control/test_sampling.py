@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from sfkd_jax import control
-from sfkd_jax.control.planners._mppi import (
+from sfkd_jax.control.planners._sampling import (
+    KINDS,
+    SamplingPlanner,
     effective_sample_size,
     shrunk,
     softmin,
     temperature_for,
 )
-from sfkd_jax.control.planners._noise import KINDS, SamplingPlanner
 
 HORIZON, SAMPLES = 20, 4000
 STD = jnp.asarray([0.5, 2.0])

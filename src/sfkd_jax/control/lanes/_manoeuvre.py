@@ -21,8 +21,7 @@ from sfkd_jax.control.lanes._reference import (
     curve,
     speed_profile,
 )
-from sfkd_jax.control.tasks._constraints import constrained
-from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task
+from sfkd_jax.control.tasks._task import RolloutSetup, StepResult, Task, constrained
 from sfkd_jax.lanes import Obstacles, beside, distance, place_at
 from sfkd_jax.paths import quintic
 from sfkd_jax.ranges import Fraction, NonNegative, Positive, Span, check_intervals

@@ -1,4 +1,4 @@
-"""Model predictive path integral control of any task."""
+"""Planners that sample: their noise, MPPI, and the cross-entropy method."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.control.planners._noise import SamplingPlanner
 from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,
+    Planner,
     PlannerState,
     Plans,
     SearchResult,
@@ -22,15 +23,92 @@ from sfkd_jax.control.planners._planner import (
     replace_nonfinite,
     tuned,
 )
-from sfkd_jax.ranges import Positive
-from sfkd_jax.types import Key, Scalar
+from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Positive, UnitInterval, check_choice
+from sfkd_jax.types import Control, Key, Scalar
 
+KINDS = ("ar1", "white", "spline")
 BISECTIONS, DECADES = 24, (-12.0, 4.0)
 """The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
 lower end is that small because a single outlier widens the range.
 """
 FEW = 10.0
 """Effective samples where every sample violates a constraint."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SamplingPlanner(Planner):
+    """A planner that perturbs a plan with noise out of standard normal numbers w.
+
+        ar1     ε_{k+1} = ρ ε_k + √(1 − ρ²) w_k
+        white   ε_k = w_k
+        spline  cubic Lagrange interpolation between w at equidistant knots
+
+    Attributes:
+        num_samples: M, plans that are sampled and rolled out per iteration.
+        iterations: of sampling and choosing per control step.
+        noise: "ar1", "white" or "spline".
+        noise_correlation: ρ.
+        noise_knots: number of knots, at most one a step.
+    """
+
+    num_samples: AtLeastOne = 1500
+    iterations: AtLeastOne = 1
+    noise: str = "ar1"
+    noise_correlation: UnitInterval = 0.8
+    noise_knots: AtLeastTwo = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("noise", self.noise, KINDS)
+        if self.noise == "spline" and self.noise_knots > self.horizon:
+            raise ValueError(
+                f"noise_knots must lie in [2, {self.horizon}], got {self.noise_knots}"
+            )
+
+    def draw(self, key: Key, std: Control) -> Plans:
+        """Return noise of a standard deviation for each control."""
+        knots = self.noise_knots if self.noise == "spline" else self.horizon
+        shape = (knots, self.num_samples, std.shape[0])
+        white = jax.random.normal(key, shape)
+        if self.noise == "white":
+            return white * std[None, None]
+        if self.noise == "ar1":
+            factor = autoregression(self.horizon, self.noise_correlation)
+        else:
+            factor = spline(self.horizon, self.noise_knots)
+            # Rows of unit length: the same spread at every step.
+            factor = factor / np.linalg.norm(factor, axis=1, keepdims=True)
+        # Full precision: accelerators otherwise round float32 factors to ten bits.
+        table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
+        noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
+        # Scaled last: XLA would draw numbers one by one if a scale followed at once.
+        return noise * std[None, None]
+
+
+def autoregression(horizon: int, rho: float) -> Float[np.ndarray, "horizon horizon"]:
+    """Weights of w in ε; ε_0 = w_0, which has the stationary variance already."""
+    steps = np.arange(horizon)
+    factor = np.tril(rho ** np.abs(steps[:, None] - steps))
+    factor[:, 1:] *= np.sqrt(1.0 - rho**2)
+    return factor
+
+
+def spline(horizon: int, knots: int) -> Float[np.ndarray, "horizon knots"]:
+    """Weights of cubic interpolation at each step between equidistant knots.
+
+    With fewer than four knots, the order is lower.
+    """
+    times = np.arange(horizon)[:, None] * (knots - 1.0) / (horizon - 1.0)
+    order = min(4, knots)
+    # The four knots around a time; at the ends, the first or last four.
+    first = np.clip(np.floor(times) - (order - 1) // 2, 0, knots - order)
+    near = (first + np.arange(order)).astype(int)
+    # Weights that reproduce the polynomials 1, t, …, around each time.
+    powers = (near - times)[:, None] ** np.arange(order)[:, None]
+    factor = np.zeros((horizon, knots))
+    weights = np.linalg.solve(powers, np.eye(order)[:, :1])
+    np.put_along_axis(factor, near, weights[..., 0], axis=1)
+    return factor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,3 +263,74 @@ def temperature_for(costs: Float[Array, " sample"], wanted: Scalar) -> Scalar:
     ends = jnp.log(10.0) * jnp.asarray(DECADES)
     low, high = jax.lax.fori_loop(0, BISECTIONS, narrow, (ends[0], ends[1]))
     return spread * jnp.exp(0.5 * (low + high))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cem(SamplingPlanner):
+    """The cross-entropy method.
+
+        ν ← mean of the elites,   σ_k ← max(their standard deviation at step k, σ_min)
+
+    Each iteration samples plans, keeps the elites and fits mean and standard deviation
+    to them. A rollout that is not finite is never an elite.
+
+    Attributes:
+        elites: number of samples kept.
+        smallest_scale: σ_min relative to noise_std; σ is reset to noise_std at every
+            control step.
+
+    Source: Rubinstein (1999); correlated noise as in Pinneri et al. (2020), iCEM.
+    """
+
+    num_samples: int = 500
+    iterations: int = 3
+    elites: int = 50
+    smallest_scale: float = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.elites <= self.num_samples:
+            raise ValueError(
+                "elites must lie in [1, num_samples], "
+                f"got {self.elites} of {self.num_samples}"
+            )
+
+    def search(
+        self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
+    ) -> SearchResult:
+        """Return the mean of the elites of the last iteration."""
+
+        def improve(
+            carry: tuple[Plan, Plan], key: Key
+        ) -> tuple[tuple[Plan, Plan], SearchResult]:
+            plan, scale = carry
+            # Narrower with every iteration, per step and control.
+            noise = self.draw(key, tuning.noise_std) * scale[:, None]
+            # Sample 0 is the mean itself: the best cost never increases.
+            evaluated = evaluate(plan[:, None] + noise.at[:, 0].set(0.0))
+            ranks, _ = evaluated.ranked()
+            negated, chosen = jax.lax.top_k(-ranks, self.elites)
+            # Fewer finite rollouts than elites: only those count.
+            counts = jnp.isfinite(negated).astype(float)
+            size = jnp.sum(counts)
+            weights = counts / jnp.maximum(size, 1.0)
+            elite = replace_nonfinite(evaluated.perturbations, 0.0)[:, chosen]
+            mean = jnp.einsum("m,tmc->tc", weights, elite)
+            squares = (elite - mean[:, None]) ** 2
+            spread = jnp.sqrt(jnp.einsum("m,tmc->tc", weights, squares))
+            result = SearchResult(
+                plan=mean,
+                usable=size > 0,
+                cost=-negated[0],
+                effective_samples=size,
+                best=elite[:, 0],
+            )
+            # A spread of zero could never grow again.
+            scale = jnp.maximum(spread / tuning.noise_std, self.smallest_scale)
+            return (mean, scale), result
+
+        return iterate(improve, (plan, jnp.ones_like(plan)), key, self.iterations)
+
+
+cem = factory(Cem, Cem.controller)
+"""(task, settings of `Cem`) -> `Controller`."""
