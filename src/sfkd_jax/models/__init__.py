@@ -1,6 +1,8 @@
 """Rollout models: listed by name in `FACTORIES`."""
 
 from sfkd_jax.models._continuous import flat as flat
+from sfkd_jax.models._continuous import icode as icode
+from sfkd_jax.models._continuous import icode_mppi as icode_mppi
 from sfkd_jax.models._continuous import nested as nested
 from sfkd_jax.models._continuous import neural_ode as neural_ode
 from sfkd_jax.models._continuous import one_step as one_step
@@ -8,8 +10,6 @@ from sfkd_jax.models._continuous import physics as physics
 from sfkd_jax.models._continuous import state_model as state_model
 from sfkd_jax.models._continuous import step_of as step_of
 from sfkd_jax.models._control_synth import control_synth as control_synth
-from sfkd_jax.models._icode import icode as icode
-from sfkd_jax.models._icode import icode_mppi as icode_mppi
 from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._own import own as own
 from sfkd_jax.models.sfkd import sfkd as sfkd
