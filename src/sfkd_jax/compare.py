@@ -9,7 +9,7 @@ from sfkd_jax import store
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.comparing import Comparison
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.report.comparison import write_results_page
+from sfkd_jax.report.run import write_results_page
 
 
 def run(settings: Settings) -> dict[str, Any]:

@@ -18,11 +18,10 @@ from sfkd_jax.evaluation.metrics import METRICS, Metric
 from sfkd_jax.lanes import Obstacles, lane_along
 from sfkd_jax.paths import path_through
 from sfkd_jax.report import figures, style, tables
-from sfkd_jax.report.comparison import write_results_page
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import Film, LaneFilm, film_of
 from sfkd_jax.report.pages import to_latex
-from sfkd_jax.report.run import write_report
+from sfkd_jax.report.run import write_report, write_results_page
 from sfkd_jax.store import ArtefactError
 
 
