@@ -71,8 +71,8 @@ def split(
     key: Key,
     *,
     shares: tuple[float, float, float, float],
-    env_low: Float[Array, " environment"],
-    env_high: Float[Array, " environment"],
+    env_low: Float[Array, " environment"] | tuple[float, ...],
+    env_high: Float[Array, " environment"] | tuple[float, ...],
     scenarios: Int[Array, " segment"] | None = None,
 ) -> Dataset:
     """Split a batch at random into training, validation, calibration and test.
@@ -100,7 +100,7 @@ def split(
                 "check the vehicle that drove them"
             )
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
-    if not envs.shape[-1:] == jnp.shape(env_low) == jnp.shape(env_high):
+    if not envs.shape[-1:] == np.shape(env_low) == np.shape(env_high):
         raise ValueError(
             f"environment.low and environment.high need {envs.shape[-1]} entries, "
             f"got {env_low} and {env_high}"

@@ -93,6 +93,7 @@ def _simulate(settings: Settings) -> Dataset:
     environments = len(settings.environment.low or (0, 0))
     check_step(build.build_vehicle(settings.vehicle), environments)
     options: Any = settings.dataset
+    box: Any = settings.environment.box
     # A key each: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
@@ -106,9 +107,8 @@ def _simulate(settings: Settings) -> Dataset:
         trajectories,
         split_key,
         shares=options.shares,
-        env_low=jnp.asarray(settings.environment.low),
-        env_high=jnp.asarray(settings.environment.high),
         scenarios=jnp.asarray(labels),
+        **box,
     )
 
 
@@ -134,7 +134,7 @@ def _generator(
     changes["held_out"] = switching
     box: Any = settings.environment.box
     if settings.along_path:
-        options = arguments(settings.dataset, generate_along_path) | changes
+        options = settings.along_path.options | changes
         return partial(generate_along_path, closed_loop(settings), **options, **box)
     plant = build.build_vehicle(settings.vehicle)
     options = arguments(settings.dataset, generate) | changes
@@ -249,8 +249,8 @@ def _strays(
 ) -> Callable[[PathLaw], float]:
     """Return law -> how far from its paths a step drives under it alone [mm, RMS]."""
     quiet = dict.fromkeys(("steering_excitation", "speed_excitation"), QUIET)
-    excited = settings.along_path.law.perturbation  # pyright: ignore
-    options: Any = arguments(settings.dataset, generate_along_path) | quiet
+    along: Any = settings.along_path
+    options, excited = along.options | quiet, along.law.perturbation
     options |= {"segments": 240, "steps": 100, **settings.environment.box}
     seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), ALONE)
 
@@ -292,8 +292,8 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
 
 def _learned_step(settings: Settings, plant: Vehicle) -> Step:
     """The step of a regression of runs without a law, over the axes of the law."""
-    along, box = settings.along_path, settings.environment.box
-    law: Any = along and along.law
+    box: Any = settings.environment.box
+    law: Any = settings.along_path and settings.along_path.law
     seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
     begun = time.perf_counter()
@@ -312,9 +312,7 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
         runs,
         split_key,
         shares=(0.9, 0.05, 0.025, 0.025),
-        env_low=jnp.asarray(settings.environment.low),
-        env_high=jnp.asarray(settings.environment.high),
-        scenarios=jnp.zeros(runs.controls.shape[0], jnp.int32),
+        **box,
     )
     model, _, params = identified.regression(dataset, start_key, fit_key)
     store.print_message(

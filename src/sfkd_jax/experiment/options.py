@@ -34,7 +34,8 @@ from sfkd_jax.ranges import (
     NonNegativeInt,
     Numbers,
 )
-from sfkd_jax.settings import OneOf, Values, parse, replace, schema, takes
+from sfkd_jax.scenarios import DriveClass
+from sfkd_jax.settings import OneOf, Values, arguments, parse, replace, schema, takes
 
 SENSORS = {"p_x": 0.015, "p_y": 0.015, "yaw": 0.002, "v": 0.03, "v_y": 0.02}
 SENSORS |= {"yaw_rate": 0.002, "steering": 0.001}
@@ -101,11 +102,25 @@ class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
 
-@takes(data.generate_along_path, skip=("held_out", *_BOX), law=LawSettings)
+@takes(
+    data.generate_along_path,
+    DriveClass,
+    skip=("limits", "held_out", *_BOX),
+    law=LawSettings,
+)
 class AlongPathSettings(DatasetSettings):
-    """Simulated data in path coordinates, around a law."""
+    """Simulated data in path coordinates, around a law.
+
+    Its drives are of a class, whose fields are settings too.
+    """
 
     law: LawSettings
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return the arguments of the generator."""
+        drives = DriveClass(**arguments(self, DriveClass))
+        return arguments(self, data.generate_along_path) | {"limits": drives}
 
 
 @build.takes_logs

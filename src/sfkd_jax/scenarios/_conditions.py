@@ -31,7 +31,7 @@ def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Sched
         steps: length.
         friction: range [-].
     """
-    level = _within(friction, key)
+    level = within(friction, key)
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
 
 
@@ -54,9 +54,9 @@ def wet_road(
         drop_time: range of its time [s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
-    high, low = _within(before, before_key), _within(after, after_key)
+    high, low = within(before, before_key), within(after, after_key)
     # A hair early: k dt may round to just below the time of the drop.
-    dry = jnp.arange(steps) * dt < _within(drop_time, time_key) - 1e-6
+    dry = jnp.arange(steps) * dt < within(drop_time, time_key) - 1e-6
     wind = gusts(gust_key, steps=steps, dt=dt, peak=PEAK_WIND)
     return jnp.stack([jnp.where(dry, high, low), wind], axis=1)
 
@@ -133,8 +133,8 @@ def gusts(key: Key, *, steps: int, dt: float, peak: float) -> Float[Array, " tim
     level_key, hold_key = jax.random.split(key)
     # Enough for the shortest holds; what is beyond the end is not used.
     count = int(steps * dt / HOLD[0]) + 2
-    levels = _within((-peak, peak), level_key, count + 1)
-    starts = jnp.cumsum(_within(HOLD, hold_key, count))
+    levels = within((-peak, peak), level_key, count + 1)
+    starts = jnp.cumsum(within(HOLD, hold_key, count))
     time = jnp.arange(steps) * dt
     gust = jnp.searchsorted(starts, time, side="right")
     # Before the first ramp the level is that of gust 0, as if its ramp were over.
@@ -184,11 +184,13 @@ def random_switching(
     levels = jax.vmap(lambda key: _from_box(key, low, high))(
         jax.random.split(level_key, count)
     )
-    ends = jnp.cumsum(_within(dwell, hold_key, count))
+    ends = jnp.cumsum(within(dwell, hold_key, count))
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
 
 
-def _within(bounds: Range, key: Key, *shape: int) -> Float[Array, "*shape"]:
+def within(
+    bounds: tuple[float | Scalar, float | Scalar], key: Key, *shape: int
+) -> Float[Array, "*shape"]:
     """Draw uniformly from a range."""
     return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
 
@@ -196,6 +198,6 @@ def _within(bounds: Range, key: Key, *shape: int) -> Float[Array, "*shape"]:
 def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
     """A point of a box; each entry is at an end of its range with probability 1/3."""
     # A wider range, clipped: the ends, where models are worst, are drawn often.
-    share = jnp.clip(_within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
+    share = jnp.clip(within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
     bottom, top = jnp.asarray(low), jnp.asarray(high)
     return bottom + share * (top - bottom)

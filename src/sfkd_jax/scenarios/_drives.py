@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sfkd_jax.ranges import Positive, Span
+from sfkd_jax.scenarios._conditions import within
 from sfkd_jax.types import Key, Scalar
 
 DRIVES = ("bends", "speeds", "lane_changes")
@@ -35,13 +37,13 @@ class DriveClass(NamedTuple):
         curvature_slope: largest |dκ/ds| [1/m²].
     """
 
-    speed: tuple[float | Scalar, float | Scalar] = (3.0, 12.0)
-    peak_curvature: float = 0.05
-    wavelengths: tuple[float, float] = (50.0, 200.0)
-    lateral_acceleration: float = 2.0
-    acceleration: float = 2.0
-    lateral_jerk: float = 7.0
-    curvature_slope: float = 0.02
+    speed: Span = (3.0, 12.0)
+    peak_curvature: Positive = 0.05
+    wavelengths: Span = (50.0, 200.0)
+    lateral_acceleration: Positive = 2.0
+    acceleration: Positive = 2.0
+    lateral_jerk: Positive = 7.0
+    curvature_slope: Positive = 0.02
 
 
 def random_drive(
@@ -85,13 +87,6 @@ def random_drive(
     return jax.lax.scan(step, start, (wanted, rates, changes))[1]
 
 
-def _between(
-    key: Key, ends: tuple[float | Scalar, float | Scalar], *shape: int
-) -> Array:
-    """Numbers from one end to the other, uniformly."""
-    return jax.random.uniform(key, shape, minval=ends[0], maxval=ends[1])
-
-
 def _tightest(limits: DriveClass, speed: Array) -> Array:
     """Largest |κ|: friction limits v² κ, so that a fast road is a straight one."""
     return jnp.minimum(limits.peak_curvature, limits.lateral_acceleration / speed**2)
@@ -101,7 +96,7 @@ def _swings(
     level_key: Key, swing_key: Key, limits: DriveClass, time: Array
 ) -> Float[Array, " time"]:
     """A speed that swings slowly about a level [m/s]."""
-    level = _between(level_key, limits.speed)
+    level = within(limits.speed, level_key)
     swing, period, begins = jax.random.uniform(swing_key, (3,))
     speeds = level + 0.8 * swing * jnp.sin(
         2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins)
@@ -119,11 +114,11 @@ def _wanted_speeds(
     )
     low, high = limits.speed
     time, legs = jnp.arange(steps) * dt, int(steps * dt / LEG[0]) + 2
-    leg = jnp.searchsorted(jnp.cumsum(_between(leg_key, LEG, legs)), time)
+    leg = jnp.searchsorted(jnp.cumsum(within(LEG, leg_key, legs)), time)
     # A quarter beyond the range, then clipped: its ends are reached and held.
     beyond = 0.25 * (high - low)
-    goals = _between(goal_key, (low - beyond, high + beyond), legs)
-    rates = _between(rate_key, (0.25, 1.25), legs)
+    goals = within((low - beyond, high + beyond), goal_key, legs)
+    rates = within((0.25, 1.25), rate_key, legs)
     # Half of the drives with lane changes brake and accelerate as well.
     moves = (group == 1) | ((group == 2) & (jax.random.uniform(kind_key) < 0.5))
     swings = _swings(level_key, swing_key, limits, time)
@@ -138,7 +133,7 @@ def _sinusoids(key: Key, wavelengths: tuple[float, float]) -> tuple[Array, ...]:
     A third are circles: the steady turn is where e_y settles widest.
     """
     wave_key, phase_key, size_key, kind_key = jax.random.split(key, 4)
-    waves = _between(wave_key, wavelengths, 3)
+    waves = within(wavelengths, wave_key, 3)
     phases = jax.random.uniform(phase_key, (3,), maxval=2 * jnp.pi)
     size = jnp.sqrt(jax.random.uniform(size_key))
     circle = jax.random.uniform(kind_key) < 1.0 / 3.0
@@ -165,8 +160,8 @@ def _lane_changes(
         jax.random.split(key, 7)
     )
     count = int(steps * dt / CHANGE[0]) + 4
-    over = _between(over_key, CHANGE, count)
-    gaps = jnp.maximum(_between(gap_key, (-1.0, 2.0), count), 0.0)
+    over = within(CHANGE, over_key, count)
+    gaps = jnp.maximum(within((-1.0, 2.0), gap_key, count), 0.0)
     ends = jnp.cumsum(over + gaps)
     # From anywhere in the first change on: a short drive need not wait for one.
     time = jnp.arange(steps) * dt + ends[0] * jax.random.uniform(start_key)
@@ -175,7 +170,7 @@ def _lane_changes(
     quintic = (60.0 * t - 180.0 * t**2 + 120.0 * t**3) / STEEPEST
     is_quintic = jax.random.uniform(shape_key) < 0.5
     shape = jnp.where(is_quintic, quintic, jnp.sin(2 * jnp.pi * t))
-    sizes = _between(size_key, (0.3, 1.3), count)
+    sizes = within((0.3, 1.3), size_key, count)
     sides = jax.random.rademacher(side_key, (count,), dtype=float)
-    base = jnp.maximum(_between(base_key, (-1.0, 0.5)), 0.0)
+    base = jnp.maximum(within((-1.0, 0.5), base_key), 0.0)
     return base, (jnp.minimum(sizes, 1.0) * sides)[index] * shape

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.lanes import Lane, Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import SPACING, Path, point_at
+from sfkd_jax.scenarios._conditions import within
 from sfkd_jax.types import Key, Scalar, State
 
 FIRST = 70.0
@@ -54,9 +55,9 @@ def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
     length = (path.points.shape[0] - 1) * SPACING
     # As many as the shortest gaps need, and no less than are shown at once.
     count = max(int((length - FIRST) / GAP[0]), IN_VIEW)
-    gaps = jax.random.uniform(gap_key, (count,), minval=GAP[0], maxval=GAP[1])
+    gaps = within(GAP, gap_key, count)
     along = FIRST - GAP[0] + jnp.cumsum(gaps)
-    aside = jax.random.uniform(offset_key, (count,), minval=-1.5, maxval=1.5)
+    aside = within((-1.5, 1.5), offset_key, count)
     obstacles = circles(beside(path, along, aside), 0.8)
     obstacles = obstacles._replace(present=along <= path.length - 50.0)
     lane = lane_along(path, width=10.5, speed=speed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from sfkd_jax.scenarios._conditions import (
     switching_road,
     uniform_road,
     wet_road,
+    within,
 )
 from sfkd_jax.scenarios._obstacles import Course, random_course
 from sfkd_jax.types import Key, Scalar, State
@@ -94,10 +95,8 @@ def scenario(
     # Longer than the distance by a tenth and a horizon: no plan meets its end.
     length = speed * duration * 1.1 + 50.0
 
-    def path(key: Key) -> Path:
-        return smooth_path(
-            key, length=length, peak_curvature=peak_curvature, wavelengths=wavelengths
-        )
+    bends: Any = {"peak_curvature": peak_curvature, "wavelengths": wavelengths}
+    path = partial(smooth_path, length=length, **bends)
 
     def conditions(key: Key) -> Float[Array, "time environment"]:
         return in_box(road(key, steps=steps, dt=dt), env_low, env_high)
@@ -154,10 +153,8 @@ def smooth_path(
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
     s = jnp.arange(int(length / SPACING) + 2) * SPACING
     # At least 0.3, or one sinusoid could be left alone.
-    amplitudes = jax.random.uniform(amplitude_key, (3, 1), minval=0.3, maxval=1.0)
-    waves = jax.random.uniform(
-        wavelength_key, (3, 1), minval=wavelengths[0], maxval=wavelengths[1]
-    )
+    amplitudes = within((0.3, 1.0), amplitude_key, 3, 1)
+    waves = within(wavelengths, wavelength_key, 3, 1)
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
     blend = jnp.clip(s / RUN_UP, 0.0, 1.0)
