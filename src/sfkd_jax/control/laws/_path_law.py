@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.control.laws._recovery import SteadyTurn
+from sfkd_jax.control.laws._feedback import SteadyTurn
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_step, put
 from sfkd_jax.ranges import AtLeastTwo, Positive, Span
 from sfkd_jax.types import Control, Environment, Scalar, Step

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control.laws._feedback import path_errors
-from sfkd_jax.control.laws._recovery import PathErrors
+from sfkd_jax.control.laws._feedback import PathErrors, path_errors
 from sfkd_jax.control.planners._planner import (
     Evaluate,
     Plan,

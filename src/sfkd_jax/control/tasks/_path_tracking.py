@@ -13,15 +13,13 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import factory
 from sfkd_jax.control.laws._feedback import (
-    FeedbackLaw,
-    RecoveringFeedback,
-    path_errors,
-)
-from sfkd_jax.control.laws._recovery import (
     CREEP,
     SLOW_STEERING,
+    FeedbackLaw,
     PathErrors,
+    RecoveringFeedback,
     admitted,
+    path_errors,
 )
 from sfkd_jax.control.tasks._task import (
     Limiter,
