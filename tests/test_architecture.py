@@ -79,9 +79,9 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 25_900, "tests": 15_510, "benchmarks, experiments": 2_500}
+LINES = {"src": 25_891, "tests": 15_509, "benchmarks, experiments": 2_497}
 """As they are; 20 000 and 15 000 are aimed at."""
-FILES_IN_SRC = 130
+FILES_IN_SRC = 121
 
 OPTIONS, EXPERIMENTS = 65, 10
 COMMITTED = {"*.json": 690_000, "figures": 1_150_000}

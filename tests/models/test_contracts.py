@@ -228,10 +228,8 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
         fiber = planning.fiber(params, run.envs[0])
         there = planning.on_road(fiber, run.controls[0, 2:]) if along else fiber
         start = planning.encode(fiber, run.states[0])
-        steps = [
-            planning.decode(fiber, planning.step(at, start, controls[0]))
-            for at in (there, fiber)
-        ]
+        after = (planning.step(at, start, controls[0]) for at in (there, fiber))
+        steps = [planning.decode(fiber, latent) for latent in after]
         own = model.fiber(params, run.envs[0])
         latent = model.step(own, model.encode(own, run.states[0]), controls[0])
         certified = chain(both, params, run), both.structure.explicit(params)
