@@ -47,6 +47,8 @@ PATH_ROWS = (
     *("neural_ode", "icode", "control_synth", "nominal", "oracle"),
     *("law_learned", "law_true", "law_nominal", "law_stanley", "law_pure_pursuit"),
 )
+SAMPLES = 1500
+"""Of a plan, in the tables."""
 BENCH3_KEEPS = (
     "seeds",
     "parameters",
@@ -76,11 +78,15 @@ def condense(results):
 
 def add_to_bench3(results):
     """Rows of sfkd-bench-3, which is driven in parts, for those of before or beside."""
-    key = itemgetter("row", "frame", "plant", "scenario")
+    key = itemgetter("row", "frame", "plant", "scenario", "samples")
+    samples = results["config"]["controller"]["mppi"]["num_samples"]
     rows = {key(row): row for row in bench3()}
-    rows |= {key(row): row for row in map(_bench3_row, results["rows"])}
+    rows |= {
+        key(row): row for row in (_bench3_row(r, samples) for r in results["rows"])
+    }
     for row in rows.values():
-        oracle = rows.get(("oracle", row["frame"], row["plant"], row["scenario"]))
+        place = row["frame"], row["plant"], row["scenario"]
+        oracle = rows.get(("oracle", *place, SAMPLES))
         row["minus_oracle_mm"] = oracle and round(difference(row, oracle)["mean"], 3)
     lines = (json.dumps(row, ensure_ascii=False) for row in rows.values())
     BENCH3.write_text("\n".join([*lines, ""]), "utf-8")
@@ -95,12 +101,12 @@ def along_path():
     """Row -> (plant, scenario) -> its line, in the order of the table."""
     found = {label: {} for label in PATH_ROWS}
     for row in bench3():
-        if row["frame"] == "path":
+        if row["frame"] == "path" and row["samples"] in (1, SAMPLES):
             found[row["row"]][row["plant"], row["scenario"]] = row
     return found
 
 
-def _bench3_row(row):
+def _bench3_row(row, samples):
     """One line: row, plant and scenario, errors by training and episode [mm]."""
     kept = _row(row)
     name, errors = kept["row"], np.asarray(kept["rmse_mm"])
@@ -109,7 +115,7 @@ def _bench3_row(row):
         "frame": "path" if "path" in kept["controller"] else "body",
         "plant": kept["vehicle"],
         "scenario": kept["scenario"],
-        "samples": 1 if name.startswith("law") else 1500,
+        "samples": 1 if name.startswith("law") else samples,
         "trainings": len(kept["seeds"]) if kept["parameters"] else 0,
         "interval_mm": np.round(evaluation.mean_interval(errors)[1], 3).tolist(),
         "commit": row["provenance"]["commit"],
