@@ -24,11 +24,8 @@ from sfkd_jax.report import figures, style
 HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
 BENCHMARKS = ("benchmark", "table1", "figure2", "corridor")
-VEHICLES = {
-    "kinematic": "kinematic",
-    "kinematic_stiff": "stiff kinematic",
-    "dynamic": "dynamic",
-}
+CARS = "kinematic", "kinematic_stiff", "dynamic"
+VEHICLES = dict(zip(CARS, ("kinematic", "stiff kinematic", "dynamic"), strict=True))
 LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
     "sfkd_no_fiber": "SFKD without e (− fiber)",
     "icode_extrinsic": "ICODE, e extrinsic",
@@ -47,8 +44,8 @@ PATH_ROWS = (
     *("neural_ode", "icode", "control_synth", "nominal", "oracle"),
     *("law_learned", "law_true", "law_nominal", "law_stanley", "law_pure_pursuit"),
 )
-SAMPLES = 1500
-"""Of a plan, in the tables."""
+CELL = itemgetter("row", "frame", "plant", "scenario", "samples")
+SAMPLES = 1500  # of a plan, in the tables
 BENCH3_KEEPS = (
     "seeds",
     "parameters",
@@ -78,15 +75,11 @@ def condense(results):
 
 def add_to_bench3(results):
     """Rows of sfkd-bench-3, which is driven in parts, for those of before or beside."""
-    key = itemgetter("row", "frame", "plant", "scenario", "samples")
     samples = results["config"]["controller"]["mppi"]["num_samples"]
-    rows = {key(row): row for row in bench3()}
-    rows |= {
-        key(row): row for row in (_bench3_row(r, samples) for r in results["rows"])
-    }
+    added = [_bench3_row(row, samples) for row in results["rows"]]
+    rows = {CELL(row): row for row in [*bench3(), *added]}
     for row in rows.values():
-        place = row["frame"], row["plant"], row["scenario"]
-        oracle = rows.get(("oracle", *place, SAMPLES))
+        oracle = rows.get(("oracle", *CELL(row)[1:4], SAMPLES))
         row["minus_oracle_mm"] = oracle and round(difference(row, oracle)["mean"], 3)
     lines = (json.dumps(row, ensure_ascii=False) for row in rows.values())
     BENCH3.write_text("\n".join([*lines, ""]), "utf-8")

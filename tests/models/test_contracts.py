@@ -203,20 +203,13 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
 
 @pytest.mark.parametrize("name", ["path", "state", "sfkd"])
 def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
-    """Not a bit of the model itself changes, whatever is added.
-
-    Along a path it is added to the tangent of F at the state that the road asks for.
-    """
-    along = name != "sfkd"
-    scales = path_space() if along else space(3)
+    """Not a bit of the model itself changes, whatever is added."""
+    scales = space(3) if name == "sfkd" else path_space()
     build = partial(models.sfkd, scales, **TINY | VARIANTS[name])
     model, both = build(), build(planning_residual=True)
-    planning = both.planning
-    params = jit(both.init)(jax.random.key(0))
-    assert planning.structure == Structure()
-    draw = partial(jax.random.normal, jax.random.key(1))
-    states = draw((3, 6)).at[:, 5].add(10.0)
-    controls = 0.01 * draw((2, 4 if along else 2))
+    planning, params = both.planning, jit(both.init)(jax.random.key(0))
+    draw, along = partial(jax.random.normal, jax.random.key(1)), both.along_path
+    states, controls = draw((3, 6)).at[:, 5].add(10.0), 0.01 * draw((2, 2 + 2 * along))
     if along:
         # e_y, e_ψ and ν are 0 in the first state, and v is v_ref: F is its tangent.
         controls = controls.at[:, 3].add(9.0).at[0, :2].set(0.0)
@@ -237,11 +230,14 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
 
     folded = jit(partial(fold, both))(params)
     alone = jit(lambda p: (chain(model, p, run), model.structure.explicit(p)))(folded)
+    before = driven(folded)[0]
+    assert same(before, alone, rtol=1e-6, atol=1e-6)
+    assert planning.structure == Structure()
     for size in (0.0, 0.1, 1e30, np.nan):
         more = jax.tree.map(lambda leaf, size=size: leaf + size, params["planning"])
         changed = folded._replace(weights={**params, "planning": more})
         certified, (split, whole, expected) = driven(changed)
-        assert same(certified, alone, rtol=0, atol=0)
+        assert same(certified, before, rtol=0, atol=0)
         # Sums of other orders, relative to a speed of 10 m/s.
         assert same(whole, expected, rtol=1e-6, atol=1e-5) == (size == 0.0)
         if size < 1.0:
