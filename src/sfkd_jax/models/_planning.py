@@ -132,7 +132,7 @@ class Planning:
         return PlanningFiber(self.certified.fiber(params, env), residual)
 
     def step(self, fiber: PlanningFiber, state: State, control: Control) -> State:
-        """Advance the state, or ξ along a path, by one sampling period."""
+        """Advance the state, or (ξ, 1) along a path, by one sampling period."""
         nu, g = control[:FREE], fiber.residual
         if not self.certified.along_path:
             after = self._certified(fiber, state, control)

@@ -22,6 +22,8 @@ Plans: TypeAlias = Float[Array, "horizon sample control"]
 TOGETHER = 16_384
 """Largest number of samples that are rolled out at once, for the memory: smaller ones
 leave cores less to share."""
+SHORT = 24
+"""Entries of a sample's state up to which samples are the last axis of a step."""
 C = TypeVar("C")
 Memory = TypeVar("Memory")
 
@@ -273,19 +275,22 @@ class Planner(Stateful):
                 worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
             return after.sample, (after._replace(sample=None), worst)
 
-        # Samples are the last axis throughout: of vectors of two or three entries a
-        # processor would use a fraction of its width.
-        every = jax.vmap(body, in_axes=(-1, (-1, None, None)), out_axes=-1)
+        # Of vectors of a few entries a processor would use a fraction of its width, so
+        # that samples are the last axis; longer ones it multiplies faster as rows.
+        entries = sum(leaf.size for leaf in jax.tree.leaves(setup.start))
+        # Axis of the samples in one step, and in arrays of all steps.
+        axis, along_steps = (-1, -1) if entries <= SHORT else (0, 1)
+        step = jax.vmap(body, in_axes=(axis, (axis, None, None)), out_axes=axis)
 
         def together(plans: Array) -> Any:
+            count = plans.shape[0]
             start = jax.tree.map(
-                lambda leaf: jnp.tile(leaf[..., None], plans.shape[0]), setup.start
+                lambda leaf: jnp.repeat(jnp.expand_dims(leaf, axis), count, axis),
+                setup.start,
             )
-            steps = jnp.moveaxis(plans, 0, -1), setup.targets, places
-            return jax.tree.map(
-                lambda leaf: jnp.moveaxis(leaf, -1, 0),
-                jax.lax.scan(every, start, steps)[1],
-            )
+            inputs = jnp.moveaxis(plans, 0, along_steps), setup.targets, places
+            _, seen = jax.lax.scan(step, start, inputs)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), seen)
 
         # Batches of one size.
         size = -(-plans.shape[1] // -(-plans.shape[1] // TOGETHER))
