@@ -177,8 +177,7 @@ def test_what_planners_add_to_the_model_reaches_no_guard():
         if not size < 1e30:
             assert not bool(info["healthy"])
             xi, road = jnp.asarray([0.05, 0.0, 10.0]), jnp.asarray([0.0, 10.0])
-            lawful = trained.law(xi, *road, ENV)
-            np.testing.assert_allclose(u, lawful, atol=1e-5)
+            np.testing.assert_allclose(u, trained.law(xi, *road, ENV), atol=1e-5)
     assert all(same(one, told[0], rtol=0, atol=0) for one in told[1:])
 
 
@@ -194,7 +193,8 @@ def test_a_planner_in_a_guard_sees_what_the_gate_believes():
         told = x + jnp.asarray(faults.get(k, [0.0] * 4))
         road = straight(20).at[:, 0].add(x[0])
         u, state, info = act(trained.params, state, told, ENV, road)
-        np.testing.assert_allclose(info["seen"], x, atol=0.15 * (k in faults))
+        most = np.asarray([0.1, 0.1, 0.1, 0.15]) * (k in faults)
+        np.testing.assert_array_less(np.abs(info["seen"] - x), most + 1e-6)
         x = trained.vehicle.step(x, u, ENV)
 
 

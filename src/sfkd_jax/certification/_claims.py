@@ -58,6 +58,7 @@ class Claims:
 
 def with_room(weights: Exported, room: float = 1.0001) -> Exported:
     """Return larger networks, so that every inequality of a witness has room."""
+    # A hundred times the 1e-6 by which other compilers round weights, see the tests.
     residual = tuple(room * layer for layer in weights.residual)
     decoder = tuple(room * layer for layer in weights.decoder)
     return weights._replace(residual=residual, decoder=decoder)

@@ -2,7 +2,7 @@
 
 A new kind is an entry of `RESIDUALS`: a flax module called like `Sandwich`. What it
 returns is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and
-the trusted core check, no other form. What planners alone add is `PlanningModel`.
+the trusted core check, no other form. What planners alone add is `Planning`.
 """
 
 from __future__ import annotations
