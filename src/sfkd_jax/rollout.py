@@ -13,6 +13,7 @@ from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import (
     BODY,
     Control,
+    Environment,
     Fiber,
     Latent,
     Model,
@@ -71,8 +72,8 @@ class Offset(NamedTuple):
 
     params: Any  # of the model, folded or not; in a fiber, the fiber of the model
     inputs: Control  # added to every control, as a bias of B(e) u and of the residual
-    # Added to every latent step, a pytree like the latent; None for nothing.
-    latent: Latent | None
+    # (x, Δx): what every step adds is Δx, lifted at x; in a fiber, a latent. None: 0.
+    shift: Any
 
 
 def with_offset(model: Model) -> Model:
@@ -85,10 +86,18 @@ def with_offset(model: Model) -> Model:
 
     def step(fiber: Offset, latent: Latent, control: Control) -> Latent:
         after = model.step(fiber.params, latent, control + fiber.inputs)
-        # None, not zeros: a model without a latent shift pays nothing for it.
-        if fiber.latent is None:
+        # None, not zeros: a model without a shift pays nothing for it.
+        if fiber.shift is None:
             return after
-        return jax.tree.map(jnp.add, after, fiber.latent)
+        return jax.tree.map(jnp.add, after, fiber.shift)
+
+    def fiber(params: Offset, env: Environment) -> Offset:
+        own, shift = model.fiber(params.params, env), params.shift
+        # By each model: what guards has another latent than what plans.
+        if shift is not None:
+            at, by = shift
+            _, shift = jax.jvp(lambda state: model.encode(own, state), (at,), (by,))
+        return Offset(own, params.inputs, shift)
 
     def inner(function: Callable[..., Any] | None) -> Any:
         # Everything else sees the model's own parameters or fiber.
@@ -98,10 +107,7 @@ def with_offset(model: Model) -> Model:
     return model._replace(
         # A scalar 0 broadcasts over any control, whose size is not known here.
         init=lambda key: Offset(model.init(key), jnp.zeros(()), None),
-        # After the model's own fiber: δ and b are no functions of e.
-        fiber=lambda params, env: params._replace(
-            params=model.fiber(params.params, env)
-        ),
+        fiber=fiber,
         encode=inner(model.encode),
         step=step,
         decode=inner(model.decode),

@@ -125,25 +125,22 @@ def test_an_offset_shifts_a_step_and_nothing_else():
     states = [path_state(jnp.asarray([9.5 + k])) for k in range(2)]
     control_, delta = jnp.asarray([0.01, 0.2]), jnp.full(2, 0.01)
     latents = [model.encode(fiber, state) for state in states]
-    push = jax.tree.map(lambda leaf: 0.1 * jnp.ones_like(leaf), latents[0])
+    push = states[0], path_state(jnp.asarray([0.1]))
+    _, lifted = jax.jvp(partial(model.encode, fiber), push[:1], push[1:])
     fiber_ = shifted.fiber(Offset(params, delta, push), env)
     plain = [model.step(fiber, latent, control_ + delta) for latent in latents]
     moved = [shifted.step(fiber_, latent, control_) for latent in latents]
     gap = lambda pair: model.vector(pair[1]) - model.vector(pair[0])
     np.testing.assert_allclose(gap(moved), gap(plain), atol=1e-6)
-    np.testing.assert_allclose(
-        model.vector(moved[0]) - model.vector(plain[0]), 0.1, atol=1e-6
-    )
+    shift = model.vector(moved[0]) - model.vector(plain[0])
+    np.testing.assert_allclose(shift, model.vector(lifted), atol=1e-6)
 
 
 def test_the_certificate_of_the_model_holds_for_the_adapted_one():
     """Its explicit weights are the same arrays; other weights are refused."""
     model, params = model_and_params("path")
     certificate = certified("path")
-    latent = jax.eval_shape(
-        lambda: model.encode(model.fiber(params, jnp.zeros(2)), jnp.zeros(4))
-    )
-    push = jax.tree.map(lambda leaf: jnp.full(leaf.shape, 1e3), latent)
+    push = jnp.zeros(4), jnp.full(4, 1e3)
     offset = Offset(params, jnp.full(2, 50.0), push)
     adapted = exported(with_offset(model), offset)
     certification.verify(certificate, offset.params, model=model, weights=adapted)

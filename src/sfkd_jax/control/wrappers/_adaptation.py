@@ -298,8 +298,5 @@ def _compensation(
     # Beyond what data and planners add, the model was not learned.
     most = 2.0 * loop.law.perturbation[0]
     steering = jnp.clip(jnp.nan_to_num(steering), -most, most)
-    moved = path_state(shifted)
-    _, latent = jax.jvp(
-        lambda state: model.encode(fiber, state), (path_state(coordinates),), (moved,)
-    )
-    return Offset(params, jnp.zeros(4).at[0].set(steering), latent)
+    shift = path_state(coordinates), path_state(shifted)
+    return Offset(params, jnp.zeros(4).at[0].set(steering), shift)
