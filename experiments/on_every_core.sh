@@ -12,7 +12,7 @@ if [ "${#cores[@]}" -gt 1 ]; then
   for vehicle in $vehicles; do python -m sfkd_jax.generate "+experiment=$name" vehicle="$vehicle" "$@"; done
   shares=()
   # Jobs in the background ignore Ctrl-C, so that they would go on alone.
-  trap 'kill "${shares[@]}" 2>/dev/null; wait; exit 130' INT TERM
+  trap 'kill $(jobs -p) 2>/dev/null; wait; exit 130' INT TERM
   for number in "${!cores[@]}"; do
     taskset -c "${cores[number]}" python -m sfkd_jax.compare "+experiment=$name" "comparison.share=[$number,${#cores[@]}]" "$@" &
     shares+=($!)
