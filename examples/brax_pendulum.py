@@ -151,19 +151,20 @@ def learned_task(model, plant) -> control.Task:
 
     def prepare(params, observation, env, reference, applied):
         fiber = model.fiber(params, env)
-        return control.RolloutSetup(
-            fiber, (model.encode(fiber, observation), applied.control), reference
-        )
+        latent = model.encode(fiber, observation)
+        first = control.Sample(latent, observation, applied.control)
+        return control.RolloutSetup(fiber, first, reference)
 
     def step(weights, fiber, before, wanted, target, at):
         v = jnp.clip(wanted, low, high)
-        latent = model.step(fiber, before[0], v)
+        latent = model.step(fiber, before.latent, v)
         state = model.decode(fiber, latent)
-        return control.StepResult(
-            (latent, v), stage(weights, state, v, before[1], target), v, v, state
-        )
+        return control.StepResult(control.Sample(latent, state, v), v, v, state)
 
-    return control.Task(low, high, (), prepare, step, lambda *_: None)
+    def cost(weights, before, after, target, at):
+        return stage(weights, after.state, after.control, before.control, target)
+
+    return control.Task(low, high, (), prepare, step, lambda *_: None, cost)
 
 
 def gain_alone(dt: float) -> Controller:

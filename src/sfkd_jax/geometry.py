@@ -42,6 +42,16 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
+def entrywise(function: Callable[..., Scalar], *vectors: Any) -> Array:
+    """Return a function of the entries of vectors, one by one.
+
+    A planner has the samples as the last axis. One operation on a vector of each of
+    them and another that all share, or a number of each, would turn the arrays around.
+    """
+    entries = [function(*entries) for entries in zip(*vectors, strict=True)]
+    return jnp.stack(jax.lax.optimization_barrier(entries))
+
+
 def put(vector: Array, index: int, value: Array) -> Array:
     """Return the vector with another entry; a choice fuses where a scatter does not."""
     return jnp.where(np.arange(vector.shape[0]) == index, value, vector)

@@ -209,7 +209,8 @@ def state_errors(
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     """Map a function of a batch over the leading axis, `size` items at a time.
 
-    The last batch is padded: `jax.lax.map` would compile a second program for it.
+    The last batch is padded: `jax.lax.map` would compile a second program for it. Each
+    batch takes items from all of the axis, of every device that it is spread over.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     if count <= size:
@@ -218,10 +219,14 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     def batched(leaf: Array) -> Array:
         # Padding repeats the first items: real data, so that no NaN appears in it.
         padded = jnp.concatenate([leaf, leaf[: -count % size]])
-        return padded.reshape(-1, size, *leaf.shape[1:])
+        return padded.reshape(size, -1, *leaf.shape[1:]).swapaxes(0, 1)
 
     results = jax.lax.map(function, jax.tree.map(batched, items))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
+
+    def joined(leaf: Array) -> Array:
+        return leaf.swapaxes(0, 1).reshape(-1, *leaf.shape[2:])[:count]
+
+    return jax.tree.map(joined, results)
 
 
 def defects(

@@ -113,7 +113,7 @@ def test_the_law_is_linear_near_the_path_and_continuous_beyond(derived):
     xi = np.asarray(turn.state) + random.uniform(-1, 1, (300, turn.state.size)) * 0.1
     xi[:, :2] += random.uniform(-1, 1, (300, 2)) * (0.35, 0.02)
     linear = jax.vmap(lambda xi: turn.control - turn.gain @ (xi - turn.state))
-    np.testing.assert_array_equal(jax.vmap(turn.feedback)(xi), linear(xi))
+    np.testing.assert_allclose(jax.vmap(turn.feedback)(xi), linear(xi), atol=1e-6)
     # Along lines out to 20 m no step is larger than its slope allows. Only where the
     # car may turn either way, with its back to where it has to go, there is a jump.
     ends = np.tile(np.asarray(turn.state), (40, 1))

@@ -32,6 +32,7 @@ from sfkd_jax.control.tasks._path_tracking import StageInputs as StageInputs
 from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
 from sfkd_jax.control.tasks._path_tracking import tracking_cost as tracking_cost
 from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
+from sfkd_jax.control.tasks._task import Sample as Sample
 from sfkd_jax.control.tasks._task import StepResult as StepResult
 from sfkd_jax.control.tasks._task import Task as Task
 from sfkd_jax.control.tasks._task import at_step as at_step

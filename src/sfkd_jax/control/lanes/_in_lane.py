@@ -228,10 +228,13 @@ class InLane(Stateful):
         # A plan that continues an old one is not the one that was evaluated.
         cost = jnp.where(usable, info["mean_cost"], jnp.inf)
         rows = jnp.concatenate([row[None], task.ways_round(situation)])
-        ways = jax.vmap(
-            partial(task.step, planner.tuning.cost, situation, jnp.zeros(()))
-        )(rows[1:])
-        costs = jnp.append(cost, jnp.where(ways.state <= 0.0, ways.cost, jnp.inf))
+
+        def worth(row: Control) -> Scalar:
+            plan = task.reference(situation, row)
+            judged = task.judge(planner.tuning.cost, situation, plan)
+            return jnp.where(judged.violation <= 0.0, judged.cost, jnp.inf)
+
+        costs = jnp.append(cost, jax.vmap(worth)(rows[1:]))
         chosen = jnp.argmin(costs)
         found = task.reference(situation, rows[chosen])
         # The next search begins there.

@@ -169,7 +169,7 @@ class Manoeuvres:
     ) -> StepResult:
         """Return the cost of one row, and its violation in place of a state."""
         judged = self.judge(weights, situation, self.reference(situation, row))
-        return StepResult(sample, judged.cost, row, row, judged.violation)
+        return StepResult(sample, row, row, judged.violation, judged.cost)
 
     def reference(self, situation: Situation, row: Control) -> Committed:
         """Return the reference of a row of parameters."""

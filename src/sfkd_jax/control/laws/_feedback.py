@@ -9,12 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, wrap_angle
+from sfkd_jax.geometry import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    PathState,
+    entrywise,
+    wrap_angle,
+)
 from sfkd_jax.types import Control, Scalar, State
 
 NEAR = (0.45, 0.12, 3.0)
@@ -82,8 +90,11 @@ class SteadyTurn(NamedTuple):
         u = u* − K (ξ − ξ*)   near the path, elsewhere see `recovering`
         """
         # Relative to ξ*, not to 0: in side wind a car on its path has a heading error.
-        errors = coordinates - self.state
-        return recovering(self, errors, self.control - self.gain @ errors)
+        errors = entrywise(jnp.subtract, coordinates, self.state)
+        linear = entrywise(
+            lambda control, gain: control - _dot(gain, errors), self.control, self.gain
+        )
+        return recovering(self, errors, linear)
 
     @property
     def level(self) -> Scalar:
@@ -112,7 +123,8 @@ def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, ...]:
     much to turn, one that is 0 in the box `NEAR` and 1 from twice its size on, and the
     curvature that the grip allows [1/m].
     """
-    far = jnp.max(jnp.abs(errors[: PATH_SPEED + 1]) / jnp.asarray(NEAR)) - 1.0
+    off = [jnp.abs(errors[entry]) / NEAR[entry] for entry in range(len(NEAR))]
+    far = reduce(jnp.maximum, off) - 1.0
     aside, steering = jnp.abs(errors[LATERAL]), turn.gain[0]
     # A law that does not steer has no approach.
     slope = steering[LATERAL] / jnp.maximum(steering[HEADING], 1e-6)
@@ -142,7 +154,7 @@ def recovering(
     (bend, grip), speed, gain = turn.grip, turn.state[PATH_SPEED], turn.gain
     # Feed-forward helps along the path only; the rates of the body damp a slide.
     ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
-    rates = gain[0, PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
+    rates = _dot(gain[0, PATH_SPEED + 1 :], errors[PATH_SPEED + 1 :])
     wanted = ahead - gain[0, HEADING] * turned - DAMPING * rates
     held = bend * tightest
     most = CORNERING * held + 0.01
@@ -164,10 +176,18 @@ def recovering(
         BRAKING * left,
     )
     base = turn.control[1] - (lower if speed_loop else 0.0)
-    beyond = jnp.stack([wanted, base - drive])
-    # A choice, not a mixture with weight 0: near the path the law is bit for bit
-    # the linear one, around which models are learned and certified.
-    return jnp.where(far > 0.0, linear + far * (beyond - linear), linear)
+
+    # A choice, not a mixture with weight 0: near the path the law is exactly the linear
+    # one, around which models are learned and certified.
+    def mixture(beyond: Scalar, linear: Scalar) -> Scalar:
+        return jnp.where(far > 0.0, linear + far * (beyond - linear), linear)
+
+    return entrywise(mixture, (wanted, base - drive), linear)
+
+
+def _dot(gains: Float[Array, " n"], errors: Float[Array, " n"]) -> Scalar:
+    """Σ k e, see `entrywise`."""
+    return sum((k * e for k, e in zip(gains, errors, strict=True)), jnp.zeros(()))
 
 
 def _ramp(value: Scalar, rise: tuple[float, float]) -> Scalar:
@@ -180,15 +200,18 @@ def moving(actual: Scalar, speed: Scalar) -> Scalar:
     return jnp.clip(jnp.maximum(actual, speed) / CREEP, 0.0, 1.0)
 
 
-def admitted(nu: Control, actual: Scalar, speed: Scalar) -> Control:
+def admitted(
+    nu: Control, actual: Scalar, speed: Scalar, authority: Scalar | float = 1.0
+) -> Control:
     """Return what acts of a perturbation of a law, all of it unless the car stops.
 
     At rest samples do not differ in what they do, and their mean is noise. Where the
     reference stands, a perturbation may brake but not drive: few models are right at
     walking pace, and a planner with a wrong one creeps for ever.
     """
-    nu = nu * moving(actual, speed)
-    return jnp.where(speed == 0.0, nu.at[1].min(0.0), nu)
+    steering, drive = (one * moving(actual, speed) * authority for one in nu)
+    drive = jnp.where(speed == 0.0, jnp.minimum(drive, 0.0), drive)
+    return jnp.stack([steering, drive])
 
 
 def holding(actual: Scalar, speed: Scalar) -> Scalar:
@@ -273,7 +296,7 @@ class LinearFeedback:
 class RecoveringFeedback(LinearFeedback):
     """`LinearFeedback` that comes back from anywhere, crawls, and stops.
 
-    Near the path and from 5 m/s on it is that law, bit for bit, far from the path
+    Near the path and from 5 m/s on it is that law, far from the path
     `recovering`. Below 5 m/s it steers over a time and not over a distance: K is scaled
     as if the car were that fast. Where the reference stands, it brakes to standstill
     and holds the steering.

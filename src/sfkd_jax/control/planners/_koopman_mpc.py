@@ -169,7 +169,7 @@ class _LiftedTracking:
         cost = self.cost.stage(weights, stage) * (1.0 + self.terminal_weight * at.last)
         sample = _LiftedSample(z, errors, u, jnp.ones_like(before.known))
         # Without the progress: beside the reference point, as all planners report it.
-        return StepResult(sample, cost, u, u, beside(x[1:], target.point))
+        return StepResult(sample, u, u, beside(x[1:], target.point), cost)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

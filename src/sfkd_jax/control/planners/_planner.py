@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -12,16 +13,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
 from sfkd_jax.control._factory import Stateful
-from sfkd_jax.control.tasks._task import PlanningStart, RolloutSetup, StepIndex, Task
+from sfkd_jax.control.tasks._task import (
+    PlanningStart,
+    RolloutSetup,
+    Sample,
+    StepIndex,
+    Task,
+)
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
 Plan: TypeAlias = Float[Array, "horizon control"]
 Plans: TypeAlias = Float[Array, "horizon sample control"]
-TOGETHER = 16_384
-"""Largest number of samples that are rolled out at once, for the memory: smaller ones
-leave cores less to share."""
+TOGETHER = 2**25
+"""Entries of the states of all samples and steps up to which they are rolled out at
+once: 128 MiB, of which there are a few copies.
+"""
 SHORT = 24
 """Entries of a sample's state up to which samples are the last axis of a step."""
 C = TypeVar("C")
@@ -263,44 +271,65 @@ class Planner(Stateful):
 
     def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
         """Roll out all plans, as many at a time as the memory holds."""
-        task, numbers = self.task, jnp.arange(self.horizon)
+        task, start, targets = self.task, setup.start, setup.targets
+        numbers = jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
 
         def body(sample: Any, inputs: Any) -> Any:
             after = task.step(tuning.cost, setup.context, sample, *inputs)
-            worst, seen = None, (after.state, after.control, *inputs[1:])
-            if task.constraint is not None:
-                every = task.constraint(tuning.constraints, *seen)
-                # NaN compares as kept, so it must not get through.
-                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
-            return after.sample, (after._replace(sample=None), worst)
+            return after.sample, after._replace(sample=None)
+
+        def judge(before: Any, after: Any, cost: Any, target: Any, at: Any) -> Any:
+            if task.cost is not None:
+                cost = task.cost(tuning.cost, before, after, target, at)
+            if task.constraint is None:
+                return cost, None
+            seen = after.state, after.control, target, at
+            every = task.constraint(tuning.constraints, *seen)
+            # NaN compares as kept, so it must not get through.
+            return cost, jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
 
         # Of vectors of a few entries a processor would use a fraction of its width, so
         # that samples are the last axis; longer ones it multiplies faster as rows.
-        entries = sum(leaf.size for leaf in jax.tree.leaves(setup.start))
+        entries = sum(leaf.size for leaf in jax.tree.leaves(start))
         # Axis of the samples in one step, and in arrays of all steps.
         axis, along_steps = (-1, -1) if entries <= SHORT else (0, 1)
         step = jax.vmap(body, in_axes=(axis, (axis, None, None)), out_axes=axis)
+        each = jax.vmap(judge, in_axes=(axis, axis, axis, None, None), out_axes=axis)
 
         def together(plans: Array) -> Any:
             count = plans.shape[0]
-            start = jax.tree.map(
-                lambda leaf: jnp.repeat(jnp.expand_dims(leaf, axis), count, axis),
-                setup.start,
+            first = jax.tree.map(
+                lambda leaf: jnp.repeat(jnp.expand_dims(leaf, axis), count, axis), start
             )
-            inputs = jnp.moveaxis(plans, 0, along_steps), setup.targets, places
-            _, seen = jax.lax.scan(step, start, inputs)
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), seen)
+            inputs = jnp.moveaxis(plans, 0, along_steps), targets, places
+            _, seen = jax.lax.scan(step, first, inputs)
+            # All of them at once: nothing depends on the cost of a step before.
+            before, after = None, Sample((), seen.state, seen.control)
+            if task.cost is not None:
+                before = jax.tree.map(
+                    lambda leaf, rest: jnp.concatenate([leaf[None], rest[:-1]]),
+                    first._replace(latent=()),
+                    after,
+                )
+            costs, worst = jax.vmap(each)(before, after, seen.cost, targets, places)
+            parts = seen.control, seen.perturbation, seen.state
+            every = Evaluated(costs, *parts, worst)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), every)
 
         # Batches of one size.
-        size = -(-plans.shape[1] // -(-plans.shape[1] // TOGETHER))
-        along, worst = jax.tree.map(
+        most = max(TOGETHER // (entries * self.horizon), 1)
+        size = math.ceil(plans.shape[1] / math.ceil(plans.shape[1] / most))
+        along = jax.tree.map(
             lambda leaf: jnp.swapaxes(leaf, 0, 1),
             in_batches(together, jnp.swapaxes(plans, 0, 1), size=size),
         )
-        worst = None if worst is None else jnp.max(worst, axis=0)
-        costs = jnp.sum(along.cost, axis=0)
-        return Evaluated(costs, along.control, along.perturbation, along.state, worst)
+        worst = along.violations
+        return along._replace(
+            # A product: a sum would be one loop with the costs that it is over.
+            costs=jnp.ones(self.horizon) @ along.costs,
+            violations=None if worst is None else jnp.max(worst, axis=0),
+        )
 
 
 def iterate(

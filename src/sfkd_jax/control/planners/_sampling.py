@@ -26,6 +26,8 @@ from sfkd_jax.control.planners._planner import (
 from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Positive, UnitInterval, check_choice
 from sfkd_jax.types import Control, Key, Scalar
 
+DEVICES = "samples"
+"""Axis of a mesh of devices."""
 KINDS = ("ar1", "white", "spline")
 BISECTIONS, DECADES = 24, (-12.0, 4.0)
 """The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
@@ -69,7 +71,7 @@ class SamplingPlanner(Planner):
         """Return noise of a standard deviation for each control."""
         knots = self.noise_knots if self.noise == "spline" else self.horizon
         shape = (knots, self.num_samples, std.shape[0])
-        white = jax.random.normal(key, shape)
+        white = spread(jax.random.normal(key, shape))
         if self.noise == "white":
             return white * std[None, None]
         if self.noise == "ar1":
@@ -83,6 +85,18 @@ class SamplingPlanner(Planner):
         noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
         # Scaled last: XLA would draw numbers one by one if a scale followed at once.
         return noise * std[None, None]
+
+
+def spread(noise: Plans) -> Plans:
+    """Return noise whose samples are spread over devices, and so are its rollouts.
+
+    If the program is traced under `jax.set_mesh` of a mesh with an axis `DEVICES`, of
+    type `jax.sharding.AxisType.Auto`.
+    """
+    if DEVICES not in jax.sharding.get_abstract_mesh().axis_names:
+        return noise
+    axes = jax.sharding.PartitionSpec(None, DEVICES)
+    return jax.lax.with_sharding_constraint(noise, axes)
 
 
 def autoregression(horizon: int, rho: float) -> Float[np.ndarray, "horizon horizon"]:

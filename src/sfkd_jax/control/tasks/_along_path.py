@@ -18,10 +18,11 @@ from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control.laws._feedback import PathErrors, SteadyTurn
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.planners._planner import all_finite
-from sfkd_jax.control.tasks._path_tracking import LawTask, StageInputs, check_path
+from sfkd_jax.control.tasks._path_tracking import LawTask, check_path
 from sfkd_jax.control.tasks._task import (
     PlanningStart,
     RolloutSetup,
+    Sample,
     StepIndex,
     StepResult,
 )
@@ -34,6 +35,7 @@ from sfkd_jax.geometry import (
     between,
     compose,
     curvature_ahead,
+    entrywise,
     followable,
     path_coordinates,
     path_state,
@@ -145,14 +147,6 @@ along_reference = factory(AlongReference, AlongReference.controller)
 """(controller along a path, coordinates=size of ξ) -> `Controller` in the world."""
 
 
-class AlongSample(NamedTuple):
-    """State of one rollout: latent, path coordinates, last control."""
-
-    latent: Any
-    coordinates: PathState
-    control: Control
-
-
 class AlongTarget(NamedTuple):
     """What all samples share of one step."""
 
@@ -205,7 +199,7 @@ class FollowingLaw(LawTask):
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
         latent = self.model.encode(fiber, path_state(coordinates))
-        start = AlongSample(latent, coordinates, before)
+        start = Sample(latent, coordinates, before)
         on_road = self.model.on_road
         fibers = on_road and jax.vmap(partial(on_road, fiber))(preview.road)
         return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
@@ -214,15 +208,15 @@ class FollowingLaw(LawTask):
         self,
         weights: Any,
         fiber: Any,
-        before: AlongSample,
+        before: Sample,
         nu: Control,
         target: AlongTarget,
         at: StepIndex,
     ) -> StepResult:
-        """Return one step of one rollout: law, perturbation, limits, model, cost."""
-        speed = target.road[1]
-        law_control = target.turn.feedback(before.coordinates)
-        nu = jnp.clip(nu, -self.law.perturbation, self.law.perturbation)
+        """Return one step of one rollout: law, perturbation, limits, model."""
+        law_control = target.turn.feedback(before.state)
+        most = jnp.asarray(self.law.perturbation)
+        nu = entrywise(jnp.clip, nu, -most, most)
         control = self.limit(law_control + nu, before.control)
         # What the limits left of ν: the model was learned on what really acted.
         effective = control - law_control
@@ -230,15 +224,19 @@ class FollowingLaw(LawTask):
         here = fiber if target.fiber is None else target.fiber
         latent = self.model.step(here, before.latent, inputs)
         coordinates = self.model.decode(fiber, latent)[BODY]
-        errors, errors_before = (
+        sample = Sample(latent, coordinates, control)
+        return StepResult(sample, control, effective, coordinates)
+
+    def errors(
+        self, before: Sample, after: Sample, target: AlongTarget
+    ) -> tuple[PathErrors, PathErrors, Scalar]:
+        """Return the errors before and after a step, and the speed of the reference."""
+        speed = target.road[1]
+        errors_before, errors = (
             PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
-            for xi in (coordinates, before.coordinates)
+            for xi in (before.state, after.state)
         )
-        stage = StageInputs(errors, errors_before, control, before.control, speed)
-        cost = self.cost.stage(weights, stage)
-        cost = cost * (1.0 + self.terminal_weight * at.last)
-        sample = AlongSample(latent, coordinates, control)
-        return StepResult(sample, cost, control, effective, coordinates)
+        return errors_before, errors, speed
 
 
 following_law = factory(FollowingLaw, lambda around: around.task(check_preview))

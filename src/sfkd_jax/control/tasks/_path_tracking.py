@@ -25,12 +25,13 @@ from sfkd_jax.control.tasks._task import (
     Limiter,
     PlanningStart,
     RolloutSetup,
+    Sample,
     StepIndex,
     StepResult,
     Task,
     actuator_limits,
 )
-from sfkd_jax.geometry import followable, is_precise, reference_curvature
+from sfkd_jax.geometry import entrywise, followable, is_precise, reference_curvature
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -128,21 +129,18 @@ def tracking_cost(
     return Cost(weights, stage)
 
 
-class PathSample(NamedTuple):
-    """State of one rollout along a path."""
-
-    latent: Any  # of the model
-    # Decoded from it; kept, because the law of the next step needs it again.
-    state: State
-    errors: PathErrors  # of the last step from the path
-    control: Control  # of the last step
-
-
 class PathTarget(NamedTuple):
     """The reference of one step."""
 
     point: Float[Array, "*horizon 4"]  # x, y, yaw, speed
     curvature: Float[Array, "*horizon"]  # of the path there [1/m]
+
+
+class PathTargets(NamedTuple):
+    """The references of a step and of the one before; of the first step twice."""
+
+    before: PathTarget
+    now: PathTarget
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +175,25 @@ class LawTask:
     def task(self, check: Callable[..., Any]) -> Task:
         """Return the planning problem as functions, of which `check` is the last."""
         own: Any = self
-        return Task(*self.box(), self.cost.weights, own.prepare, own.step, check)
+        steps = own.prepare, own.step, check, self.charge
+        return Task(*self.box(), self.cost.weights, *steps)
+
+    def errors(
+        self, before: Sample, after: Sample, target: Any
+    ) -> tuple[PathErrors, PathErrors, Scalar]:
+        """Return the errors before and after a step, and the speed of the reference."""
+        raise NotImplementedError
+
+    def charge(
+        self, weights: Any, before: Sample, after: Sample, target: Any, at: StepIndex
+    ) -> Scalar:
+        """Return the cost of one step."""
+        errors_before, errors, speed = self.errors(before, after, target)
+        controls = after.control, before.control
+        cost = self.cost.stage(
+            weights, StageInputs(errors, errors_before, *controls, speed)
+        )
+        return cost * (1.0 + self.terminal_weight * at.last)
 
     def box(self) -> tuple[Control, Control]:
         """Return the lower and upper control limits."""
@@ -220,9 +236,9 @@ class PathTracking(LawTask):
         # Many rollouts share this fibre; folding parameters that are folded is free.
         fiber = model.fiber(fold(model, params), env)
         curvature = reference_curvature(reference)
-        errors = path_errors(observation, reference[0], curvature[0])
-        targets = PathTarget(reference, curvature)
-        first = jax.tree.map(lambda leaf: leaf[0], targets)
+        now = PathTarget(reference, curvature)
+        earlier = jax.tree.map(lambda leaf: jnp.append(leaf[:1], leaf[:-1], 0), now)
+        first = jax.tree.map(lambda leaf: leaf[0], now)
         law_control, _ = self._law_control(observation, first)
         # At the first step no control is known: assume that the law has driven.
         before = jnp.where(previous.known, previous.control, law_control)
@@ -230,31 +246,35 @@ class PathTracking(LawTask):
         # Few models are right at walking pace: there the law sees the measurement.
         slow = observation[3] < SLOW_STEERING
         state = jnp.where(slow, observation, model.decode(fiber, latent))
-        start = PathSample(latent, state, errors, before)
-        return RolloutSetup(fiber, start, targets, known)
+        start = Sample(latent, state, before)
+        return RolloutSetup(fiber, start, PathTargets(earlier, now), known)
 
     def step(
         self,
         weights: Any,
         fiber: Any,
-        before: PathSample,
+        before: Sample,
         nu: Control,
-        target: PathTarget,
+        target: PathTargets,
         at: StepIndex,
     ) -> StepResult:
-        """Return one step of one rollout: law, perturbation, limits, model, cost."""
-        model, point = self.model, target.point
-        law_control, authority = self._law_control(before.state, target)
-        nu = admitted(nu, before.state[3], point[3]) * authority
+        """Return one step of one rollout: law, perturbation, limits, model."""
+        model, speed = self.model, target.now.point[3]
+        law_control, authority = self._law_control(before.state, target.now)
+        nu = admitted(nu, before.state[3], speed, authority)
         control = self.limit(law_control + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)
-        errors = path_errors(after, point, target.curvature)
-        inputs = StageInputs(errors, before.errors, control, before.control, point[3])
-        cost = self.cost.stage(weights, inputs)
-        cost = cost * (1.0 + self.terminal_weight * at.last)
-        sample = PathSample(latent, after, errors, control)
-        return StepResult(sample, cost, control, control - law_control, after)
+        sample = Sample(latent, after, control)
+        return StepResult(sample, control, control - law_control, after)
+
+    def errors(
+        self, before: Sample, after: Sample, target: PathTargets
+    ) -> tuple[PathErrors, PathErrors, Scalar]:
+        """Return the errors before and after a step, and the speed of the reference."""
+        earlier, now = target
+        errors_before = path_errors(before.state, *earlier)
+        return errors_before, path_errors(after.state, *now), now.point[3]
 
     def _law_control(self, state: State, target: PathTarget) -> tuple[Control, Scalar]:
         """The control of the law, clipped to the limits, and its planner's authority.
@@ -268,7 +288,7 @@ class PathTracking(LawTask):
         control = law(errors, curvature, point[3])
         if isinstance(law, RecoveringFeedback):
             authority = law.authority(errors, point[3])
-        return jnp.clip(control, *self.box()), authority
+        return entrywise(jnp.clip, control, *self.box()), authority
 
 
 path_tracking = factory(PathTracking, lambda around: around.task(check_path))

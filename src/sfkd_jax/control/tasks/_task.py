@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import factory
+from sfkd_jax.geometry import entrywise
 from sfkd_jax.lanes import outside_box
 from sfkd_jax.types import Control, Params, Scalar
 
@@ -46,7 +47,8 @@ class RolloutSetup(NamedTuple):
 
     Attributes:
         context: shared by all samples and steps.
-        start: state of one rollout before its first step.
+        start: state of one rollout before its first step; a `Sample` if the task has a
+            `cost`.
         targets: data of each step; every leaf has the horizon as its leading axis.
         followable: whether the plan is for the reference that was given; if not, the
             control is what the task does instead, and not healthy.
@@ -58,22 +60,36 @@ class RolloutSetup(NamedTuple):
     followable: Bool[Array, ""] | bool = True
 
 
+class Sample(NamedTuple):
+    """State of one rollout.
+
+    Attributes:
+        latent: of the model; () where that is the state.
+        state: predicted last.
+        control: applied last.
+    """
+
+    latent: Any
+    state: Any
+    control: Control
+
+
 class StepResult(NamedTuple):
     """One step of one rollout.
 
     Attributes:
         sample: state of the rollout after the step.
-        cost: of the step.
         control: applied in the step.
         perturbation: the part of the row of the plan that the limits allowed.
         state: predicted state after the step; reported, not carried.
+        cost: of the step; None where `Task.cost` gives it.
     """
 
     sample: Any
-    cost: Scalar
     control: Control
     perturbation: Control
     state: Any
+    cost: Scalar | None = None
 
 
 class Task(NamedTuple):
@@ -92,6 +108,9 @@ class Task(NamedTuple):
         check: (observation, env, reference, horizon) -> whether the positions are
             precise, or None where there are none; raises a ValueError that
             names an argument of the wrong shape.
+        cost: (weights, sample before, sample after, target, step index) -> cost of a
+            step, from samples without latents. Evaluated for all steps at once, which
+            is faster than in `step`; None if `step` gives it.
         constraint: see `constrained`; None for no constraint.
         constraint_data: that the constraint is given.
     """
@@ -102,6 +121,7 @@ class Task(NamedTuple):
     prepare: Callable[[Params, Any, Any, Any, PlanningStart], RolloutSetup]
     step: Callable[[Any, Any, Any, Control, Any, StepIndex], StepResult]
     check: Callable[[Any, Any, Any, int], Bool[Array, ""] | None]
+    cost: Callable[[Any, Sample, Sample, Any, StepIndex], Scalar] | None = None
     constraint: Constraint | None = None
     constraint_data: Any = ()
 
@@ -120,18 +140,23 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
             "control_low must lie below control_high, entry by entry, "
             f"got {low} and {high}"
         )
-    bottom, top = jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
-    if rate is None:
-        return lambda wanted, before: jnp.clip(wanted, bottom, top)
+    rate = np.inf if rate is None else rate
     if np.shape(rate) not in ((), np.shape(low)) or not np.all(np.greater(rate, 0)):
         raise ValueError(f"control_rate needs positive numbers, got {rate}")
-    most = dt * jnp.asarray(rate, dtype=float)
+    ends = low, high, dt * np.asarray(rate, float)
+    bottom, top, most = (jnp.asarray(end, dtype=float) for end in ends)
 
-    def limit(wanted: Control, before: Control) -> Control:
+    def entry(
+        wanted: Scalar, before: Scalar, bottom: Scalar, top: Scalar, most: Scalar
+    ) -> Scalar:
         # An actuator outside its box returns to it at once, whatever its slew limit.
         before = jnp.clip(before, bottom, top)
         low, high = before - most, before + most
         return jnp.clip(wanted, jnp.maximum(bottom, low), jnp.minimum(top, high))
+
+    def limit(wanted: Control, before: Control) -> Control:
+        ends = (jnp.broadcast_to(end, wanted.shape) for end in (bottom, top, most))
+        return entrywise(entry, wanted, before, *ends)
 
     return limit
 
@@ -202,13 +227,6 @@ def at_step(values: Array, at: StepIndex) -> Array:
     return values[jnp.minimum(at.number, values.shape[0] - 1)]
 
 
-class FreeSample(NamedTuple):
-    """State of one rollout of a plain state equation: state and last control."""
-
-    state: Any
-    control: Control
-
-
 @dataclass(frozen=True, eq=False)
 class FreeTask:
     """The task of minimising any cost under any state equation.
@@ -255,7 +273,7 @@ class FreeTask:
         """Return the planning problem as functions."""
         box = np.broadcast_arrays(self.control_low, self.control_high)
         low, high = (jnp.asarray(end, dtype=float) for end in box)
-        steps = self.prepare, self.step, _check_reference
+        steps = self.prepare, self.step, _check_reference, self.charge
         return Task(low, high, self.weights, *steps)
 
     def prepare(
@@ -275,25 +293,31 @@ class FreeTask:
         state = jax.tree.map(
             lambda leaf, like: jnp.asarray(leaf, like.dtype), observation, after
         )
-        return RolloutSetup((params, env), FreeSample(state, before), reference)
+        return RolloutSetup((params, env), Sample((), state, before), reference)
 
     def step(
         self,
         weights: Any,
         context: tuple[Params, Any],
-        before: FreeSample,
+        before: Sample,
         nu: Control,
         goal: Any,
         at: StepIndex,
     ) -> StepResult:
-        """Return one step of one rollout: limits, state equation, cost."""
+        """Return one step of one rollout: limits and state equation."""
         params, env = context
         control = self.limit(nu, before.control)
         state = self.dynamics(params, before.state, control, env)
-        cost = self.stage(weights, state, control, before.control, goal)
+        return StepResult(Sample((), state, control), control, control, state)
+
+    def charge(
+        self, weights: Any, before: Sample, after: Sample, goal: Any, at: StepIndex
+    ) -> Scalar:
+        """Return the cost of one step."""
+        cost = self.stage(weights, after.state, after.control, before.control, goal)
         if self.terminal is not None:
-            cost = cost + at.last * self.terminal(weights, state, goal)
-        return StepResult(FreeSample(state, control), cost, control, control, state)
+            cost = cost + at.last * self.terminal(weights, after.state, goal)
+        return cost
 
 
 free_task = factory(FreeTask, FreeTask.task)
