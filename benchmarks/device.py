@@ -1,8 +1,10 @@
 """Control steps and parallel episodes of the shipped policies on this device.
 
-python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]: median and
-99 % time of a jitted control step by the number of samples, and one-minute S3 episodes
-simulated at once, with the share that stays in the certified corridor.
+python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]: time and
+memory of a jitted control step by the number of samples, and of several also by horizon
+and vehicles; and one-minute S3 episodes simulated at once, with the share that stays in
+the certified corridor. With XLA_FLAGS=--xla_force_host_platform_device_count=2 it
+spreads the samples over two devices.
 """
 
 import json
@@ -21,15 +23,16 @@ from sfkd_jax import evaluation, scenarios
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
 NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
+FEW, AUTO = 300, (jax.sharding.AxisType.Auto,)
 HORIZON, SETTLED, PERIOD = 20, 20, 0.1
 """Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
 
 
-def loaded(name, samples, **changes):
+def loaded(name, samples, *, horizon=HORIZON, **changes):
     """The shipped policy along a path with another number of samples, and settings."""
     directory = SHIPPED / f"{name}_path"
     settings = sfkd_jax.load(directory).settings["controller"]
-    mppi = settings["mppi"] | {"num_samples": samples}
+    mppi = settings["mppi"] | {"num_samples": samples, "horizon": horizon}
     return sfkd_jax.load(directory, controller=settings | {"mppi": mppi} | changes)
 
 
@@ -63,32 +66,69 @@ def rmse_mm(lateral):
     return 1e3 * np.sqrt(np.mean(lateral**2, axis=1))
 
 
-def control_step(name, samples, steps, **changes):
-    """Wall time of one control step, transfers of state and control included."""
-    policy = loaded(name, samples, **changes)
-    episode = jax.jit(family(policy.vehicle, "s3", 10.0))(jax.random.key(0))
-    reference = scenarios.reference_window(
-        episode.path,
-        jnp.zeros(()),
-        episode.speed,
-        dt=policy.vehicle.dt,
-        horizon=HORIZON,
+def control_step(name, steps, *, samples, vehicles=1, at_once=1, horizon=HORIZON):
+    """Time of one control step of one of several vehicles, in batches of `at_once`.
+
+    What a single vehicle observes comes from the host, and its control goes back; its
+    samples are spread over all devices.
+    """
+    policy = loaded(name, samples, horizon=horizon)
+    episode = jax.jit(family(policy.vehicle, "s3", 15.0))(jax.random.key(0))
+    seen = (
+        episode.initial_state,
+        episode.envs[0],
+        scenarios.reference_window(
+            episode.path,
+            jnp.zeros(()),
+            episode.speed,
+            dt=policy.vehicle.dt,
+            horizon=horizon,
+        ),
     )
-    act = jax.jit(policy.controller.act)
-    memory = policy.controller.init(jax.random.key(0))
-    seen = map(np.asarray, (episode.initial_state, episode.envs[0], reference))
-    seen, times = tuple(seen), []
-    for _ in range(steps + 5):
-        start = time.perf_counter()
-        control, memory, _ = act(policy.params, memory, *seen)
-        np.asarray(control)
-        times.append(1e3 * (time.perf_counter() - start))
+    keys = jax.random.key(0)
+    init, act = policy.controller.init, partial(policy.controller.act, policy.params)
+    if vehicles > 1:
+        seen = jax.tree.map(lambda leaf: jnp.stack([leaf] * vehicles), seen)
+        keys, one = jax.random.split(keys, vehicles), act
+        init = jax.vmap(init)
+
+        def act(*given):
+            return jax.lax.map(lambda own: one(*own), given, batch_size=at_once)
+
+    seen = jax.tree.map(np.asarray, seen)
+    mesh = jax.make_mesh((jax.device_count(),), ("samples",), AUTO)
+    everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    # As it comes back, or the second step would compile again.
+    memory, times, jitted = jax.device_put(init(keys), everywhere), [], jax.jit(act)
+    with jax.set_mesh(mesh):
+        needed = jitted.lower(memory, *seen).compile().memory_analysis()
+        for _ in range(steps + 5):
+            start = time.perf_counter()
+            control, memory, _ = jitted(memory, *seen)
+            np.asarray(control)
+            times.append(1e3 * (time.perf_counter() - start) / vehicles)
     return {
+        "samples": samples,
+        "vehicles": vehicles,
+        "at_once": at_once,
+        "horizon": horizon,
+        "devices": jax.device_count(),
         "median_ms": float(np.median(times[5:])),
         "p99_ms": float(np.quantile(times[5:], 0.99)),
-        "first_s": 1e-3 * times[0],
-        "compilations": act._cache_size(),
+        "memory_mib": needed.temp_size_in_bytes / 2**20,
+        "compilations": jitted._cache_size(),
     }
+
+
+def scales(samples):
+    """What is measured: samples, horizons, vehicles."""
+    for number in samples:
+        yield {"samples": number}
+    if len(samples) > 1:
+        for horizon in (10, 50, 100):
+            yield {"samples": samples[0], "horizon": horizon}
+        for at_once, vehicles in ((16, 16), (16, 256), (256, 256)):
+            yield {"samples": FEW, "vehicles": vehicles, "at_once": at_once}
 
 
 def episodes(name, samples, count, seed):
@@ -120,11 +160,13 @@ def main():
         __doc__, __file__, cars=CARS, samples=[1500], steps=200, episodes=16, seed=2026
     )
     device = jax.devices()[0].device_kind
+    if jax.device_count() > 1:
+        device = f"{jax.device_count()} x {device}"
     for name in asked.cars:
-        steps = {
-            str(samples): control_step(name, samples, asked.steps)
-            for samples in asked.samples
-        }
+        steps = [
+            control_step(name, max(asked.steps // one.get("vehicles", 1), 10), **one)
+            for one in scales(asked.samples)
+        ]
         found = {"control_step": steps}
         if asked.episodes:
             found["s3"] = episodes(name, asked.samples[0], asked.episodes, asked.seed)
