@@ -18,6 +18,7 @@ from sfkd_jax.control.tasks._task import (
     RolloutSetup,
     Sample,
     StepIndex,
+    StepResult,
     Task,
 )
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
@@ -32,6 +33,8 @@ once: 128 MiB, of which there are a few copies.
 """
 SHORT = 24
 """Entries of a sample's state up to which samples are the last axis of a step."""
+UNROLLED = 4
+"""Steps of longer states in one pass of a loop."""
 C = TypeVar("C")
 Memory = TypeVar("Memory")
 
@@ -275,27 +278,33 @@ class Planner(Stateful):
         numbers = jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
 
-        def body(sample: Any, inputs: Any) -> Any:
-            after = task.step(tuning.cost, setup.context, sample, *inputs)
-            return after.sample, after._replace(sample=None)
-
-        def judge(before: Any, after: Any, cost: Any, target: Any, at: Any) -> Any:
-            if task.cost is not None:
-                cost = task.cost(tuning.cost, before, after, target, at)
-            if task.constraint is None:
-                return cost, None
-            seen = after.state, after.control, target, at
-            every = task.constraint(tuning.constraints, *seen)
-            # NaN compares as kept, so it must not get through.
-            return cost, jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
-
         # Of vectors of a few entries a processor would use a fraction of its width, so
-        # that samples are the last axis; longer ones it multiplies faster as rows.
+        # that samples are the last axis, and costs are evaluated for all steps at once.
+        # Longer ones it multiplies faster as rows, and should not leave its cache.
         entries = sum(leaf.size for leaf in jax.tree.leaves(start))
+        short = entries <= SHORT
         # Axis of the samples in one step, and in arrays of all steps.
-        axis, along_steps = (-1, -1) if entries <= SHORT else (0, 1)
+        axis, along_steps = (-1, -1) if short else (0, 1)
+
+        def judge(before: Any, after: StepResult, target: Any, at: StepIndex) -> Any:
+            cost, worst, seen = after.cost, None, (after.state, after.control)
+            if task.cost is not None:
+                pair = before._replace(latent=()), Sample((), *seen)
+                cost = task.cost(tuning.cost, *pair, target, at)
+            if task.constraint is not None:
+                every = task.constraint(tuning.constraints, *seen, target, at)
+                # NaN compares as kept, so it must not get through.
+                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
+            parts = after.control, after.perturbation, after.state
+            return Evaluated(cost, *parts, worst)
+
+        def body(before: Any, inputs: Any) -> Any:
+            after = task.step(tuning.cost, setup.context, before, *inputs)
+            seen = after._replace(sample=None)
+            return after.sample, seen if short else judge(before, seen, *inputs[1:])
+
         step = jax.vmap(body, in_axes=(axis, (axis, None, None)), out_axes=axis)
-        each = jax.vmap(judge, in_axes=(axis, axis, axis, None, None), out_axes=axis)
+        each = jax.vmap(judge, in_axes=(axis, axis, None, None), out_axes=axis)
 
         def together(plans: Array) -> Any:
             count = plans.shape[0]
@@ -303,19 +312,17 @@ class Planner(Stateful):
                 lambda leaf: jnp.repeat(jnp.expand_dims(leaf, axis), count, axis), start
             )
             inputs = jnp.moveaxis(plans, 0, along_steps), targets, places
-            _, seen = jax.lax.scan(step, first, inputs)
-            # All of them at once: nothing depends on the cost of a step before.
-            before, after = None, Sample((), seen.state, seen.control)
-            if task.cost is not None:
-                before = jax.tree.map(
-                    lambda leaf, rest: jnp.concatenate([leaf[None], rest[:-1]]),
-                    first._replace(latent=()),
-                    after,
-                )
-            costs, worst = jax.vmap(each)(before, after, seen.cost, targets, places)
-            parts = seen.control, seen.perturbation, seen.state
-            every = Evaluated(costs, *parts, worst)
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), every)
+            _, seen = jax.lax.scan(step, first, inputs, unroll=1 if short else UNROLLED)
+            if short:
+                before = None
+                if task.cost is not None:
+                    before = jax.tree.map(
+                        lambda leaf, rest: jnp.concatenate([leaf[None], rest[:-1]]),
+                        first._replace(latent=()),
+                        Sample((), seen.state, seen.control),
+                    )
+                seen = jax.vmap(each)(before, seen, targets, places)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), seen)
 
         # Batches of one size.
         most = max(TOGETHER // (entries * self.horizon), 1)

@@ -72,18 +72,17 @@ class SamplingPlanner(Planner):
         knots = self.noise_knots if self.noise == "spline" else self.horizon
         shape = (knots, self.num_samples, std.shape[0])
         white = spread(jax.random.normal(key, shape))
-        if self.noise == "white":
-            return white * std[None, None]
-        if self.noise == "ar1":
-            factor = autoregression(self.horizon, self.noise_correlation)
-        else:
+        if self.noise == "spline":
             factor = spline(self.horizon, self.noise_knots)
             # Rows of unit length: the same spread at every step.
             factor = factor / np.linalg.norm(factor, axis=1, keepdims=True)
-        # Full precision: accelerators otherwise round float32 factors to ten bits.
+        else:
+            rho = self.noise_correlation if self.noise == "ar1" else 0.0
+            factor = autoregression(self.horizon, rho)
+        # A product for white noise too: without one, XLA draws numbers one by one where
+        # they are scaled. In full precision: accelerators round factors to ten bits.
         table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
         noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
-        # Scaled last: XLA would draw numbers one by one if a scale followed at once.
         return noise * std[None, None]
 
 
