@@ -200,26 +200,36 @@ def recovery():
 
 
 def timing():
-    """A control step of the shipped policies by device and number of samples."""
+    """A control step of the dynamic car by samples, horizon and vehicles."""
     devices = read("benchmarks/device.json")["devices"]
+    policies = [about["policies"]["dynamic_path"] for about in devices.values()]
+
+    def case(step):
+        words = f"{step['samples']} x {step['horizon']}"
+        if step["vehicles"] > 1:
+            words += f", {step['vehicles']} vehicles, {step['at_once']} at once"
+        return words
+
+    def size(step):
+        vehicles = step["vehicles"], step["at_once"]
+        return *vehicles, step["horizon"] != 20, step["samples"], step["horizon"]
+
+    every = [sorted(one["control_step"], key=size) for one in policies]
+    steps = zip(*every, strict=True)
     lines = [
         [
-            device,
-            samples,
-            f"{step['median_ms']:.1f}",
-            f"{step['p99_ms']:.1f}",
-            f"{about['policies']['dynamic_path']['s3']['steps_per_s']:.0f}"
-            if samples == "1500"
-            else "",
+            case(each[0]),
+            *(
+                f"{one['median_ms']:.{1 if one['median_ms'] > 1 else 2}f}"
+                for one in each
+            ),
+            f"{each[-1]['memory_mib']:.1f}",
         ]
-        for device, about in devices.items()
-        for samples, step in sorted(
-            about["policies"]["dynamic_path"]["control_step"].items(),
-            key=lambda item: int(item[0]),
-        )
+        for each in steps
     ]
-    head = ["device", "samples", "control step, median [ms]", "99 % [ms]"]
-    return table([*head, "steps per second, many episodes at once"], lines)
+    many = [f"{one['s3']['steps_per_s']:.0f}" for one in policies]
+    lines.append(["simulated steps per second, many episodes", *many, ""])
+    return table(["samples x steps; ms a vehicle", *devices, "memory [MiB]"], lines)
 
 
 def adaptation():

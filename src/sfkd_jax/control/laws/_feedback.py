@@ -91,9 +91,7 @@ class SteadyTurn(NamedTuple):
         """
         # Relative to ξ*, not to 0: in side wind a car on its path has a heading error.
         errors = entrywise(jnp.subtract, coordinates, self.state)
-        linear = entrywise(
-            lambda control, gain: control - _dot(gain, errors), self.control, self.gain
-        )
+        linear = entrywise(jnp.subtract, self.control, self.gain @ errors)
         return recovering(self, errors, linear)
 
     @property
@@ -154,7 +152,7 @@ def recovering(
     (bend, grip), speed, gain = turn.grip, turn.state[PATH_SPEED], turn.gain
     # Feed-forward helps along the path only; the rates of the body damp a slide.
     ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
-    rates = _dot(gain[0, PATH_SPEED + 1 :], errors[PATH_SPEED + 1 :])
+    rates = gain[0, PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
     wanted = ahead - gain[0, HEADING] * turned - DAMPING * rates
     held = bend * tightest
     most = CORNERING * held + 0.01
@@ -183,11 +181,6 @@ def recovering(
         return jnp.where(far > 0.0, linear + far * (beyond - linear), linear)
 
     return entrywise(mixture, (wanted, base - drive), linear)
-
-
-def _dot(gains: Float[Array, " n"], errors: Float[Array, " n"]) -> Scalar:
-    """Σ k e, see `entrywise`."""
-    return sum((k * e for k, e in zip(gains, errors, strict=True)), jnp.zeros(()))
 
 
 def _ramp(value: Scalar, rise: tuple[float, float]) -> Scalar:
