@@ -10,7 +10,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export PYTHONPATH=${PYTHONPATH:-src}:.
 # With factors of ten bits the controls are others, and no witness of a certificate holds.
 export JAX_DEFAULT_MATMUL_PRECISION=float32
-root=runs/device sizes=(--samples 1500 16384 --episodes 1024) parts=()
+root=runs/device sizes=(--samples 1500 64 300 1024 4096 16384 65536 --steps 100 --episodes 1024) parts=()
 for word in "$@"; do
   case $word in
     --small) sizes=(--cars dynamic --samples 16 --steps 5 --episodes 0) ;;
@@ -21,6 +21,7 @@ for word in "$@"; do
 done
 [ "${#parts[@]}" -gt 0 ] || { echo "no part given; choose of controls, speed, train, table" >&2 && exit 2; }
 mkdir -p "$root"
+export JAX_COMPILATION_CACHE_DIR=${JAX_COMPILATION_CACHE_DIR:-$root/compiled}
 for part in "${parts[@]}"; do
   case $part in
     controls) python -m pytest -q tests/test_goldens.py ;;
