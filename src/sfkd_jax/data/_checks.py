@@ -256,9 +256,8 @@ class Checks:
         opposite[chords.middle[off > np.pi - 0.5]] = True
         # A single jump turns as many chords as there are over it.
         least = round(2 * LOOK / log.period)
-        for rows in np.split(
-            np.arange(len(opposite)), np.flatnonzero(np.diff(opposite)) + 1
-        ):
+        edges = np.flatnonzero(np.diff(opposite)) + 1
+        for rows in np.split(np.arange(len(opposite)), edges):
             if opposite[rows[0]] and len(rows) > least and (off < 0.5).sum() > least:
                 yield Finding(
                     f"{log.between(int(rows[0]), int(rows[-1]))}: the robot moves "
@@ -407,11 +406,10 @@ class Checks:
             ),
         }
         # A mean over the whole run: single wrong rows change no reading.
-        fits = [
+        fit, best = max(
             (agreement(chords.course - read).real, text)
             for text, read in readings.items()
-        ]
-        fit, best = max(fits)
+        )
         off = f"{log.whole}: {name} and the direction of travel differ"
         if fit > 0.9:
             yield Finding(f"{off}; {best}")

@@ -104,15 +104,50 @@ def generate(
         those of `segment_scenarios`.
     """
     excitation = jnp.asarray([steering_excitation, speed_excitation])
-    schedules = _schedules(steps, vehicle.dt, env_low, env_high)
-    planned = _planned(key, schedules, segments, held_out=held_out)
-    parts = [
-        jax.lax.map(
-            partial(_segment, vehicle, driver, conditions, steps, speed, excitation),
-            keys,
-            batch_size=BATCH,
+    low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
+
+    def one(conditions: Conditions, key: Key) -> Trajectory:
+        road_key, speed_key, spread_key, noise_key, start_key, offset_key = (
+            jax.random.split(key, 6)
         )
-        for conditions, keys in planned
+        target = jax.random.uniform(speed_key, (), minval=speed[0], maxval=speed[1])
+        size = len(vehicle.state_names)
+        scenario = family(conditions, PATHS, speed=10.0, state_size=size)(road_key)
+        path = scenario.path
+        # The first environment also holds while the car settles.
+        settling = jnp.tile(scenario.envs[:1], (SETTLING, 1))
+        envs = jnp.concatenate([settling, scenario.envs])
+        spread = _log_uniform(spread_key, excitation)
+        white = jax.random.normal(noise_key, (steps + SETTLING, 2))
+
+        def step(
+            carry: tuple[State, Scalar, Array], inputs: tuple[Array, Array]
+        ) -> tuple[Any, Any]:
+            state, progress, noise = carry
+            env, fresh = inputs
+            noise = _coloured(noise, spread, fresh)
+            ahead = reference_window(path, progress, target, dt=vehicle.dt, horizon=2)
+            # Clipped after the excitation: the model learns the command that was
+            # applied.
+            control = jnp.clip(driver(state, ahead) + noise, low, high)
+            after = vehicle.step(state, control, env)
+            progress, _ = project(path, after[:2], progress + after[3] * vehicle.dt)
+            return (after, progress, noise), (after, control)
+
+        progress = 20.0 * jax.random.uniform(offset_key)
+        offset = jax.random.uniform(start_key, (), minval=-1.0, maxval=1.0)
+        start = scenario.initial_state.at[3].set(target + offset)
+        # By a window, whose rounding is part of every data set of a seed.
+        here = reference_window(path, progress, jnp.zeros(()), dt=0.0, horizon=1)[0]
+        start = start.at[:3].set(here[:3])
+        carry = start, progress, spread * white[0]
+        _, (states, controls) = jax.lax.scan(step, carry, (envs, white))
+        return Trajectory(states[SETTLING - 1 :], controls[SETTLING:], envs[SETTLING:])
+
+    schedules = _schedules(steps, vehicle.dt, env_low, env_high)
+    parts = [
+        jax.lax.map(partial(one, conditions), keys, batch_size=BATCH)
+        for conditions, keys in _planned(key, schedules, segments, held_out=held_out)
     ]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
@@ -192,7 +227,6 @@ def generate_open_loop(
         env_high: upper corner of E.
     """
     low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
-    spreads = jnp.asarray([[0.003, 0.08], [0.1, 1.5]])
 
     def one(key: Key) -> Trajectory:
         env_key, speed_key, bend_key, spread_key, noise_key = jax.random.split(key, 5)
@@ -205,7 +239,7 @@ def generate_open_loop(
         share = jax.random.uniform(bend_key, (), minval=-1.0)
         tightest = jnp.minimum(lateral_acceleration / begin**2, 0.25)
         steering = jnp.arctan(vehicle.wheelbase * share * jnp.abs(share) * tightest)
-        spread = _log_uniform(spread_key, spreads)
+        spread = _log_uniform(spread_key, jnp.asarray([[0.003, 0.08], [0.1, 1.5]]))
         white = jax.random.normal(noise_key, (steps + SETTLING, 2))
 
         def step(carry: tuple[State, Array], fresh: Array) -> tuple[Any, Any]:
@@ -308,54 +342,6 @@ def _log_uniform(
 def _coloured(noise: Array, spread: float | Array, fresh: Array) -> Array:
     """One step of an AR(1) process of a given spread, from fresh white noise."""
     return CORRELATION * noise + jnp.sqrt(1.0 - CORRELATION**2) * spread * fresh
-
-
-def _segment(
-    vehicle: Vehicle,
-    driver: Driver,
-    conditions: Conditions,
-    steps: int,
-    speeds: Range,
-    excitation: Float[Array, "control 2"],
-    key: Key,
-) -> Trajectory:
-    """One segment in the world."""
-    road_key, speed_key, spread_key, noise_key, start_key, offset_key = (
-        jax.random.split(key, 6)
-    )
-    speed = jax.random.uniform(speed_key, (), minval=speeds[0], maxval=speeds[1])
-    sample = family(conditions, PATHS, speed=10.0, state_size=len(vehicle.state_names))
-    scenario = sample(road_key)
-    path = scenario.path
-    # The first environment also holds while the car settles.
-    envs = jnp.concatenate([jnp.tile(scenario.envs[:1], (SETTLING, 1)), scenario.envs])
-    spread = _log_uniform(spread_key, excitation)
-    low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
-    white = jax.random.normal(noise_key, (steps + SETTLING, 2))
-
-    def step(
-        carry: tuple[State, Scalar, Array], inputs: tuple[Array, Array]
-    ) -> tuple[Any, Any]:
-        state, progress, noise = carry
-        env, fresh = inputs
-        noise = _coloured(noise, spread, fresh)
-        reference = reference_window(path, progress, speed, dt=vehicle.dt, horizon=2)
-        # Clipped after the excitation: the model learns the command that was applied.
-        control = jnp.clip(driver(state, reference) + noise, low, high)
-        after = vehicle.step(state, control, env)
-        progress, _ = project(path, after[:2], progress + after[3] * vehicle.dt)
-        return (after, progress, noise), (after, control)
-
-    progress = 20.0 * jax.random.uniform(offset_key)
-    offset = jax.random.uniform(start_key, (), minval=-1.0, maxval=1.0)
-    start = scenario.initial_state.at[3].set(speed + offset)
-    # By a window, whose rounding is part of every data set of a seed.
-    here = reference_window(path, progress, jnp.zeros(()), dt=0.0, horizon=1)[0]
-    start = start.at[:3].set(here[:3])
-    _, (states, controls) = jax.lax.scan(
-        step, (start, progress, spread * white[0]), (envs, white)
-    )
-    return Trajectory(states[SETTLING - 1 :], controls[SETTLING:], envs[SETTLING:])
 
 
 def drive_along_path(

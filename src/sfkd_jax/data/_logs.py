@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,8 +25,8 @@ from sfkd_jax.store import ArtefactError, one_line
 
 UNKNOWN = 2
 """Entries of the constant environment that replaces one that nobody measured."""
-DIMENSIONS = ("length", "length", "angle", "speed")
-"""Of the first states."""
+DIMENSIONS = ("time", "length", "length", "angle", "speed")
+"""Of the time and the first states."""
 LOOK = 0.5
 """Length of the chords over which motion is compared with the columns [s]."""
 LATEST, LAGS, FEWEST = 1.0, 401, 20
@@ -314,9 +315,8 @@ def read_logs(
     # A file that cannot be read is a finding beside those of the others.
     for file in files:
         try:
-            read, converted = _logs(
-                _table(file, columns, dt, blanks), columns, needs_environment
-            )
+            table = _table(file, columns, dt, blanks)
+            read, converted = _logs(table, columns, needs_environment)
         except (ArtefactError, ValueError) as reason:
             errors.append(one_line(reason))
             continue
@@ -415,10 +415,8 @@ def _logs(
         "environment": columns.environment if needs_environment else (),
         "run": () if run is None else (run,),
     }
-    needed = {name: None for names in wanted.values() for name in names}
-    needed |= {columns.time: "time"} | dict(
-        zip(columns.state, DIMENSIONS, strict=False)
-    )
+    needed: dict[str, str | None] = dict.fromkeys(chain(*wanted.values()))
+    needed |= zip((columns.time, *columns.state), DIMENSIONS, strict=False)
     try:
         matches = {
             name: find_column(name, table.columns, needed[name]) for name in needed
@@ -457,10 +455,8 @@ def _logs(
         return [log], conversions
     labels = table.columns[found[run].header]
     if labels.dtype.kind == "f" and np.isnan(labels).any():
-        raise ValueError(
-            f"{log.at(int(np.isnan(labels).argmax()))}: {run} is nan, "
-            "so its run is unknown"
-        )
+        row = int(np.isnan(labels).argmax())
+        raise ValueError(f"{log.at(row)}: {run} is nan, so its run is unknown")
     # Rows of one run continue each other, whatever lies between them in the file.
     return [
         replace(

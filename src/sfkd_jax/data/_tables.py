@@ -227,11 +227,10 @@ def _text(file: Path) -> str:
     return text
 
 
-def _cells(line: str, between: str | None = None) -> tuple[list[str], str]:
+def _cells(line: str) -> tuple[list[str], str]:
     """The cells of a line, and the separator, which it has most of."""
-    if between is None:
-        most = max(",;\t", key=line.count)
-        between = most if most in line else " "
+    most = max(",;\t", key=line.count)
+    between = most if most in line else " "
     cells = line.split() if between == " " else line.split(between)
     return [cell.strip().strip('"').strip() for cell in cells], between
 
