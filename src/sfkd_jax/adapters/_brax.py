@@ -13,15 +13,7 @@ from brax.envs.base import State as BraxState
 from brax.generalized import pipeline
 
 from sfkd_jax.adapters._task import MEASURES, DrivingTask
-from sfkd_jax.types import (
-    BODY,
-    Control,
-    Environment,
-    Key,
-    Reference,
-    State,
-    Step,
-)
+from sfkd_jax.types import BODY, Control, Environment, Key, Reference, State, Step
 
 SCALED = {
     "gravity": ("gravity", "opt.gravity"),
@@ -143,8 +135,6 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
             f"got {parameters}"
         )
     system, coordinates = inner.sys, inner.sys.q_size()
-    # The environment acts once per several steps of the physics.
-    frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:
         # The same system with scaled fields; nothing is compiled anew for another e.
@@ -159,7 +149,8 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         moment, _ = jax.lax.scan(
             lambda moment, _: (pipeline.step(changed, moment, control), None),
             pipeline.init(changed, q, qd),
-            length=frames,
+            # The environment acts once per several steps of the physics.
+            length=round(float(inner.dt) / float(system.opt.timestep)),
         )
         return _state(moment)
 

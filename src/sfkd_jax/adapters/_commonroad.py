@@ -31,6 +31,8 @@ STEERING_LAG, WIND_LEVER = 0.1, 0.4
 OBSERVED = 7
 """Number of leading states, in the order of `plants.dynamic`."""
 
+_partial = cache(partial)
+"""One function for equal settings, so that they share their workers."""
 Numbers: TypeAlias = Sequence[float]
 Car: TypeAlias = Any
 """CommonRoad's VehicleParameters, whose fields are all declared optional."""
@@ -117,14 +119,8 @@ def commonroad_vehicle(
         raise ValueError(f"car must be one of {', '.join(map(str, CARS))}, got {car}")
     if not dt > 0:
         raise ValueError(f"dt must be positive, got {dt}")
-    plant = simulator(_makes(model, car, dt, wind_force))
+    plant = simulator(_partial(_HostCar, model, car, dt, wind_force))
     return plant._replace(name=f"commonroad_{model}")
-
-
-@cache
-def _makes(*settings: Any) -> Callable[[], _HostCar]:
-    """One function for equal settings, so that they share their workers."""
-    return partial(_HostCar, *settings)
 
 
 class _HostCar:
@@ -173,7 +169,6 @@ class _HostCar:
         flow, velocity = self.flow(control, env), self.equations.velocity
 
         def too_slow(time: float, x: Any) -> float:
-            del time
             return velocity(x)[0] - SLOWEST
 
         too_slow.terminal = True  # type: ignore[attr-defined]

@@ -27,15 +27,7 @@ from sfkd_jax.scenarios import (
     project,
     reference_window,
 )
-from sfkd_jax.types import (
-    BODY,
-    POSE,
-    Control,
-    Environment,
-    Key,
-    Scalar,
-    State,
-)
+from sfkd_jax.types import BODY, POSE, Control, Environment, Key, Scalar, State
 
 MEASURES: tuple[str, ...] = ("lateral", "speed_error", "steering_rate")
 

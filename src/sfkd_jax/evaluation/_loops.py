@@ -120,7 +120,12 @@ def simulate(
         env, observed_env, sensor_key = inputs
         # Noise reaches the controller, never the truth or the scores.
         observation = state + spread * jax.random.normal(sensor_key, state.shape)
-        ahead = _ahead(scenario, progress, dt=dt, horizon=horizon)
+        if scenario.course is not None:
+            ahead: Any = scenario.course.lane, in_view(scenario.course, progress)
+        else:
+            ahead = reference_window(
+                scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
+            )
         control, memory, info = controller.act(
             params, memory, observation, observed_env, ahead
         )
@@ -145,15 +150,6 @@ def simulate(
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
     return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
-
-
-def _ahead(scenario: Scenario, progress: Scalar, *, dt: float, horizon: int) -> Any:
-    """What a controller is given to drive by."""
-    if scenario.course is not None:
-        return scenario.course.lane, in_view(scenario.course, progress)
-    return reference_window(
-        scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
-    )
 
 
 def observed_environment(
@@ -246,7 +242,6 @@ def open_loop(
         gap = (predicted - true)[:, BODY]
         # Along a path nothing is predicted of the way along it.
         still, yaw = jnp.zeros(gap.shape[0]), wrap_angle(gap[:, HEADING])
-        columns = [still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]
-        return jnp.column_stack(columns) ** 2
+        return jnp.column_stack([still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]) ** 2
 
     return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))

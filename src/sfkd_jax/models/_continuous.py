@@ -62,7 +62,6 @@ def state_model(
     """
 
     def encode(fiber: Fiber, state: State) -> State:
-        del fiber
         # Broadcasting would accept a state of another plant silently.
         if state_size is not None and state.shape != (state_size,):
             raise ValueError(
@@ -204,7 +203,6 @@ def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
         return jnp.concatenate([*parts, space.scaled_env(env)])
 
     def identify(train: Trajectory, held_out: Trajectory, key: Key) -> Params:
-        del held_out
         before, after = train.states[:, :-1], train.states[:, 1:]
         read = jax.vmap(jax.vmap(inputs))(before, train.controls, train.envs)
         read = read.reshape(-1, read.shape[-1])

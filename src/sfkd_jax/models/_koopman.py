@@ -142,13 +142,12 @@ class Lift:
         A = jnp.concatenate([jnp.zeros((self.rank, 1)), states, of_functions.T], axis=1)
         # Scales of u folded in, so that a controller multiplies physical controls.
         B = inputs / self.space.control_scale
-        c = rest[:, 0] - B @ self.space.control_mean
         return KoopmanFiber(
             # The regression is of the increment z⁺ − z; the identity makes it z⁺.
             jnp.eye(self.rank) + A,
             B,
             bend[:, 0] / self.curvature_range,
-            c,
+            rest[:, 0] - B @ self.space.control_mean,
             params["centres"],
         )
 
@@ -193,13 +192,12 @@ def identify(
     windows = Trajectory(
         states[:, : length + 1], *(leaf[:, :length] for leaf in inputs)
     )
-    drawn = (VALIDATION_SHARE * part for part in _circles(lift, circle_key, count))
-    cases = (windows, *drawn)
+    drawn = [VALIDATION_SHARE * part for part in _circles(lift, circle_key, count)]
 
     def error(weights: Float[Array, "regressor rank"]) -> Scalar:
         params = {"centres": centres, "weights": weights}
         errors = jax.vmap(lambda *each: _prediction_error(lift, params, *each))
-        return jnp.mean(errors(*cases))
+        return jnp.mean(errors(windows, *drawn))
 
     # By free prediction over a horizon, which is what a controller uses.
     errors = jax.lax.map(error, fits)

@@ -77,14 +77,10 @@ class Sandwich(nn.Module):
         # `left` carries A_{k-1}' Ψ_{k-1} on; √γ goes in at either end.
         left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
         for k, (before, after) in enumerate(pairwise(sizes)):
+            square = self.param(f"square_{k}", spread, (after, after))
+            tall = self.param(f"tall_{k}", spread, (before, after))
             # Where the Cayley transform is orthogonal in float32, see CAYLEY_RANGE.
-            square = bounded(
-                self.param(f"square_{k}", spread, (after, after)), CAYLEY_RANGE
-            )
-            tall = bounded(
-                self.param(f"tall_{k}", spread, (before, after)), CAYLEY_RANGE
-            )
-            A, B = cayley(square, tall)
+            A, B = cayley(*(bounded(free, CAYLEY_RANGE) for free in (square, tall)))
             # The last layer has no slope after it, so no Ψ and no factor √2.
             if k == len(self.hidden):
                 matrices.append(jnp.sqrt(gamma) * B @ left)
@@ -110,7 +106,6 @@ class Free(nn.Module):
         """Return plain weights; the bound is ignored."""
         # The same signature as `Sandwich`, so that
         # the ablation exchanges the class alone.
-        del bound
         sizes = pairwise((self.inputs, *self.hidden, self.outputs))
         spread = nn.initializers.lecun_normal()
         matrices = tuple(

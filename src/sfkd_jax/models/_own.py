@@ -59,7 +59,6 @@ def own(
         return model
 
     def fiber(params: Params, env: Environment) -> Fiber:
-        del env
         # The centre of E, not 0, which may be no environment at all (friction 0).
         return model.fiber(params, space.env_mean)
 

@@ -112,8 +112,7 @@ class Planning:
             return jnp.where((rows >= affine) & (rows < hidden), drawn, 0.0)
 
         layers = [nn.Dense(WIDTH), nn.tanh, nn.Dense(WIDTH), nn.tanh]
-        zeros = nn.initializers.zeros
-        last = nn.Dense(size, kernel_init=zeros, bias_init=start)
+        last = nn.Dense(size, kernel_init=nn.initializers.zeros, bias_init=start)
         return nn.Sequential([*layers, last])
 
     def init(self, key: Key) -> Params:
@@ -168,8 +167,7 @@ class Planning:
         """F on a road as (ξ, ν) ↦ ξ⁺, and ξ and ν of a car on the path."""
 
         def certified(xi: PathState, nu: Control) -> PathState:
-            control = jnp.append(nu, road)
-            return self._certified(fiber, path_state(xi), control)[BODY]
+            return self._certified(fiber, path_state(xi), jnp.append(nu, road))[BODY]
 
         xi = jnp.zeros(self.space.body_mean.shape[0]).at[PATH_SPEED].set(road[1])
         return certified, (xi, jnp.zeros(FREE))

@@ -231,8 +231,6 @@ def dynamic(
 
         slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
         lag = (control[0] - steering) / (steering_lag * steering_rate)
-        # tanh limits the rate of the actuator; a clip would have no gradient.
-        turning = steering_rate * jnp.tanh(lag)
         return jnp.stack(
             [
                 speed * jnp.cos(yaw) - side_speed * jnp.sin(yaw),
@@ -243,7 +241,8 @@ def dynamic(
                 (sideways + rear + wind) / mass - speed * yaw_rate,
                 (front_length * sideways - rear_length * rear + wind_lever * wind)
                 / yaw_inertia,
-                turning,
+                # tanh limits the rate of the actuator; a clip would have no gradient.
+                steering_rate * jnp.tanh(lag),
             ]
         )
 

@@ -96,7 +96,6 @@ def nominal_derivative(length: float, rear_length: float, *, states: int = 4) ->
     """
 
     def derivative(state: State, control: Control, env: Environment) -> State:
-        del env
         yaw, speed = state[2], state[3]
         # Without slip both wheels turn about one centre: κ = tan δ / L.
         curvature = jnp.tan(control[0]) / length

@@ -75,7 +75,9 @@ def random_drive(
         speed = speed + jnp.clip(want - speed, -rate, rate)
         bend = size * jnp.mean(jnp.sin(2 * jnp.pi * along / waves + phases))
         share = jnp.where(group == 2, base + (1.0 - jnp.abs(base)) * change, bend)
-        tightest = _tightest(limits, speed)
+        # Friction limits v² κ, so that a fast road is a straight one.
+        grip = limits.lateral_acceleration / speed**2
+        tightest = jnp.minimum(limits.peak_curvature, grip)
         slope = jnp.minimum(limits.curvature_slope, limits.lateral_jerk / speed**3)
         turn = jnp.clip(share, -1.0, 1.0) * tightest - curvature
         curvature = curvature + jnp.clip(turn, -slope * speed * dt, slope * speed * dt)
@@ -85,24 +87,6 @@ def random_drive(
 
     start = (wanted[0], jnp.zeros(()), jnp.zeros(()))
     return jax.lax.scan(step, start, (wanted, rates, changes))[1]
-
-
-def _tightest(limits: DriveClass, speed: Array) -> Array:
-    """Largest |κ|: friction limits v² κ, so that a fast road is a straight one."""
-    return jnp.minimum(limits.peak_curvature, limits.lateral_acceleration / speed**2)
-
-
-def _swings(
-    level_key: Key, swing_key: Key, limits: DriveClass, time: Array
-) -> Float[Array, " time"]:
-    """A speed that swings slowly about a level [m/s]."""
-    level = within(limits.speed, level_key)
-    swing, period, begins = jax.random.uniform(swing_key, (3,))
-    speeds = level + 0.8 * swing * jnp.sin(
-        2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins)
-    )
-    # The swing is not scaled to the range, so that its ends are reached.
-    return jnp.clip(speeds, *limits.speed)
 
 
 def _wanted_speeds(
@@ -121,8 +105,13 @@ def _wanted_speeds(
     rates = within((0.25, 1.25), rate_key, legs)
     # Half of the drives with lane changes brake and accelerate as well.
     moves = (group == 1) | ((group == 2) & (jax.random.uniform(kind_key) < 0.5))
-    swings = _swings(level_key, swing_key, limits, time)
-    wanted = jnp.where(moves, jnp.clip(goals[leg], low, high), swings)
+    # Others swing slowly about a level, not scaled to the range: its ends are reached.
+    level = within(limits.speed, level_key)
+    swing, period, begins = jax.random.uniform(swing_key, (3,))
+    swings = level + 0.8 * swing * jnp.sin(
+        2 * jnp.pi * (time / (5.0 + 15.0 * period) + begins)
+    )
+    wanted = jnp.clip(jnp.where(moves, goals[leg], swings), low, high)
     rate = jnp.where(moves, jnp.minimum(rates[leg], 1.0), 1.0)
     return wanted, limits.acceleration * rate
 

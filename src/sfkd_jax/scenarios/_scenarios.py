@@ -68,8 +68,7 @@ def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
     length = (path.points.shape[0] - 1) * SPACING
     # As many as the shortest gaps need, and no less than are shown at once.
     count = max(int((length - FIRST) / GAP[0]), IN_VIEW)
-    gaps = within(GAP, gap_key, count)
-    along = FIRST - GAP[0] + jnp.cumsum(gaps)
+    along = FIRST - GAP[0] + jnp.cumsum(within(GAP, gap_key, count))
     aside = within((-1.5, 1.5), offset_key, count)
     obstacles = circles(beside(path, along, aside), 0.8)
     obstacles = obstacles._replace(present=along <= path.length - 50.0)

@@ -237,17 +237,13 @@ class Learned(nn.Module):
         return jnp.concatenate(hidden, axis=-2), jnp.concatenate(outer, axis=-2)
 
 
-def _couplings(
-    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
-) -> Array:
+def _couplings(key: Array, shape: tuple[int, ...]) -> Array:
     """Initial couplings of norm 0.3: the initial gain of the residual is about 0.1."""
-    return jax.random.normal(key, shape, dtype) * (0.15 / shape[-1] ** 0.5)
+    return jax.random.normal(key, shape, jnp.float32) * (0.15 / shape[-1] ** 0.5)
 
 
-def _near_identity(
-    key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32
-) -> Array:
+def _near_identity(key: Array, shape: tuple[int, ...]) -> Array:
     """Initial operators: I plus a little noise, which is slow dynamics."""
     # Slow dynamics: in a sampling period of 0.1 s a car changes little.
-    noise = jax.random.normal(key, shape, dtype) * (0.1 / shape[-1] ** 0.5)
-    return jnp.eye(shape[-1], dtype=dtype) + noise
+    noise = jax.random.normal(key, shape, jnp.float32) * (0.1 / shape[-1] ** 0.5)
+    return jnp.eye(shape[-1], dtype=jnp.float32) + noise
