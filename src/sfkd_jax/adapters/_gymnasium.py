@@ -65,8 +65,7 @@ class GymnasiumVehicle(gymnasium.Env):
 
     def action(self, control: Any) -> np.ndarray:
         """Return a control of the vehicle as an action in [-1, 1]."""
-        control = jax.numpy.asarray(control, np.float32)
-        return np.asarray(self._task.action(control))
+        return np.asarray(self._task.action(jax.numpy.asarray(control, np.float32)))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -303,8 +303,7 @@ class Checks:
         chords = find_chords(log, log.states[:, 3])
         speed = log.states[chords.middle, 3]
         count = len(speed) * log.period / LOOK
-        moves = np.abs(speed) > 0.0
-        if count < 0.5 * FEWEST or not moves.all() or np.std(chords.turn) < 1e-3:
+        if count < 0.5 * FEWEST or not speed.all() or np.std(chords.turn) < 1e-3:
             return Delay()
         off = chords.course - chords.yaw
         off = np.angle(np.exp(1j * (off - np.angle(agreement(off)))))

@@ -189,10 +189,9 @@ def generate_along_path(
     )
     env_key, run_key = jax.random.split(key)
     planned = _planned(env_key, schedules, segments, held_out=held_out)
-    envs = [jax.vmap(conditions)(keys) for conditions, keys in planned]
     return drive_along_path(
         loop,
-        jnp.concatenate(envs),
+        jnp.concatenate([jax.vmap(conditions)(keys) for conditions, keys in planned]),
         run_key,
         limits=limits,
         steering_excitation=steering_excitation,

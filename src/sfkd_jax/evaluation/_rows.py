@@ -130,12 +130,11 @@ def pool(rows: list[Row]) -> Row:
     first, *rest = rows
     if not rest:
         return first
-    pooled = {one.name: one.pool_seeds(rows) for one in METRICS if one.pool_seeds}
     # What is named pools otherwise than by the mean, so it comes last.
     return _mean(rows) | {
         "arrays": first.get("arrays"),
         "seeds": [seed for entry in rows for seed in entry["seeds"]],
-        **pooled,
+        **{one.name: one.pool_seeds(rows) for one in METRICS if one.pool_seeds},
     }
 
 

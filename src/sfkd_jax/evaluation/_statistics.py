@@ -24,8 +24,7 @@ class Spread(NamedTuple):
 
     def quantile(self, p: float) -> float:
         """Two-sided p-quantile of Student's t, mixed by the shares of the variance."""
-        shares = self.share, 1.0 - self.share
-        mixed = zip(shares, self.freedom, strict=True)
+        mixed = zip((self.share, 1.0 - self.share), self.freedom, strict=True)
         return sum(-one * float(stdtrit(df, p / 2)) for one, df in mixed if one > 0)
 
 

@@ -39,10 +39,8 @@ EXPECTED = (*OUTCOMES, ArtefactError, ValueError, training.TrainingStopped, OSEr
 LONGEST_NAME = 160
 """Characters of a directory name of a sweep; file systems allow 255."""
 
-Run = Callable[[Settings], dict[str, Any]]
 
-
-def hydra_command(run: Run) -> Callable[[], None]:
+def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], None]:
     """Make `run(settings) -> document` a command.
 
     The command prints the document as JSON in the last line of stdout. Expected errors

@@ -97,14 +97,13 @@ def take_share(
 
 def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
     """Return the overrides of a cell, beyond those of the command."""
-    tuned = comparison.tuned.get(cell.vehicle, {}).get(cell.label)
     return [
         f"vehicle={cell.vehicle}",
         f"scenario={cell.scenario}",
         f"controller={cell.controller}",
         f"seed={cell.seed}",
         *(comparison.rows[cell.label] or "").split(),
-        *(tuned or "").split(),
+        *(comparison.tuned.get(cell.vehicle, {}).get(cell.label) or "").split(),
     ]
 
 
@@ -209,8 +208,7 @@ class Comparison:
     def evaluate(self) -> int:
         """Evaluate all cells that are not done, and return how many there were."""
         done = 0
-        share = self._settings.comparison.share
-        groups = take_share(group_cells(self.cells), share)
+        groups = take_share(group_cells(self.cells), self._settings.comparison.share)
         # Every row is built before the first one is trained.
         for group in groups:
             with self._named_if_it_fails(group):
@@ -232,9 +230,8 @@ class Comparison:
 
     def _composed(self, cell: Cell) -> Settings:
         """The settings of a cell, under the name of the comparison."""
-        comparison = self._settings.comparison
         try:
-            composed = command.compose(*overrides(cell, comparison))
+            composed = command.compose(*overrides(cell, self._settings.comparison))
         except (HydraException, OmegaConfBaseException) as reason:
             line = " ".join(str(reason).split("\n")[0].split())
             raise ValueError(f"row {cell.label}: {line}") from None

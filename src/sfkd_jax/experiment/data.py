@@ -64,8 +64,7 @@ def config(settings: Settings) -> dict[str, Any]:
     if isinstance(settings.vehicle, LoggedVehicleSettings):
         # `contents` say what the vehicle is; where that lies is no matter.
         del vehicle["path"], vehicle["identified"]
-    about = {"vehicle": vehicle, "environment": box, "dataset": dataset}
-    return store.plain(about)
+    return store.plain({"vehicle": vehicle, "environment": box, "dataset": dataset})
 
 
 def dataset_path(settings: Settings) -> Path:
@@ -93,7 +92,6 @@ def _simulate(settings: Settings) -> Dataset:
     environments = len(settings.environment.low or (0, 0))
     check_step(build.build_vehicle(settings.vehicle), environments)
     options: Any = settings.dataset
-    box: Any = settings.environment.box
     # A key each: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
@@ -108,7 +106,7 @@ def _simulate(settings: Settings) -> Dataset:
         split_key,
         shares=options.shares,
         scenarios=jnp.asarray(labels),
-        **box,
+        **settings.environment.box,
     )
 
 
@@ -132,7 +130,7 @@ def _generator(
 ) -> Callable[[Key], Trajectory]:
     """Return key -> the runs of a data set, or as many under the switching of S3."""
     changes["held_out"] = switching
-    box: Any = settings.environment.box
+    box = settings.environment.box
     if settings.along_path:
         options = settings.along_path.options | changes
         return partial(generate_along_path, closed_loop(settings), **options, **box)
@@ -158,8 +156,7 @@ def write(settings: Settings, dataset: Dataset) -> None:
     if dataset.runs is not None:
         arrays["runs"] = [dataset.runs[part] for part in PARTS]
     if dataset.scenarios is not None:
-        labels = dataset.scenarios
-        arrays |= {f"{part}/scenario": labels[part] for part in PARTS}
+        arrays |= {f"{part}/scenario": dataset.scenarios[part] for part in PARTS}
     about = config(settings)
     store.write_arrays(dataset_path(settings), arrays, kind=DATASET, config=about)
 
@@ -210,26 +207,25 @@ def derive_law(settings: Settings) -> PathLaw:
     """
     along: Any = settings.along_path
     plant = build.build_vehicle(settings.vehicle)
-    steps = {"plant": lambda: plant.step}
-    steps |= dict.fromkeys(("nominal", *TEXTBOOK), lambda: plant.nominal)
+    name, step = along.law.model, plant.step
+    if name in ("nominal", *TEXTBOOK):
+        step = plant.nominal
     # A model of logs is a learned one already.
-    logged = isinstance(settings.vehicle, LoggedVehicleSettings)
-    learned = partial(_learned_step, settings, plant)
-    steps["learned"] = steps["plant"] if logged else learned
-    step = steps[along.law.model]()
+    elif name == "learned" and not isinstance(settings.vehicle, LoggedVehicleSettings):
+        step = _learned_step(settings, plant)
     store.print_message(
-        f"deriving the law of vehicle {plant.name} from its {along.law.model} model"
+        f"deriving the law of vehicle {plant.name} from its {name} model"
     )
-    box: Any = settings.environment.box
+    box = settings.environment.box
     derive = partial(
         derive_path_law,
         step,
         coordinates=len(plant.state_names) - 1,
-        **{name: tuple(map(float, ends)) for name, ends in box.items()},
+        **{corner: tuple(map(float, ends)) for corner, ends in box.items()},
         **arguments(along.law, derive_path_law),
     )
     law = jax.jit(derive)()
-    if (name := along.law.model) in TEXTBOOK:
+    if name in TEXTBOOK:
         stray, about = _strays(settings, plant, plant.step), TEXTBOOK[name]
         made = [textbook_law(law, name, k, wheelbase=plant.wheelbase) for k in about]
         found = [stray(one) for one in made]
@@ -292,28 +288,21 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
 
 def _learned_step(settings: Settings, plant: Vehicle) -> Step:
     """The step of a regression of runs without a law, over the axes of the law."""
-    box: Any = settings.environment.box
+    box = settings.environment.box
     law: Any = settings.along_path and settings.along_path.law
     seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
     begun = time.perf_counter()
-    runs = jax.jit(
-        partial(
-            generate_open_loop,
-            plant,
-            # A little beyond the axes, at whose ends steady turns are sought.
-            speed=(0.8 * law.speed[0], 1.1 * law.speed[1]),
-            lateral_acceleration=1.2 * law.lateral_acceleration,
-            **box,
-        )
-    )(run_key)
-    (runs,) = _without_faults(settings, runs)
-    dataset = split(
-        runs,
-        split_key,
-        shares=(0.9, 0.05, 0.025, 0.025),
+    drive = partial(
+        generate_open_loop,
+        plant,
+        # A little beyond the axes, at whose ends steady turns are sought.
+        speed=(0.8 * law.speed[0], 1.1 * law.speed[1]),
+        lateral_acceleration=1.2 * law.lateral_acceleration,
         **box,
     )
+    (runs,) = _without_faults(settings, jax.jit(drive)(run_key))
+    dataset = split(runs, split_key, shares=(0.9, 0.05, 0.025, 0.025), **box)
     model, _, params = identified.regression(dataset, start_key, fit_key)
     store.print_message(
         f"fitted a model of vehicle {plant.name} to {runs.controls.shape[0]} runs in "

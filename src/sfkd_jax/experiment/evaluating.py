@@ -183,8 +183,7 @@ class SystemEvaluation:
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores = self._scored(episodes, 0.0)
-        about = {"scenario": episodes.name}
-        row = evaluation.row(scores, self._columns | about)
+        row = evaluation.row(scores, self._columns | {"scenario": episodes.name})
         if forces := self._settings.evaluation.side_forces:
             row["disturbed"] = []
         for force in forces:

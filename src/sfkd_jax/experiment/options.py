@@ -65,7 +65,7 @@ class EnvironmentSettings:
     source: Annotated[str, OneOf(build.ENV_SOURCES)] = "measured"
 
     @property
-    def box(self) -> dict[str, tuple[float, ...] | None]:
+    def box(self) -> dict[str, Any]:
         """The corners of E, as arguments of factories."""
         return {"env_low": self.low, "env_high": self.high}
 

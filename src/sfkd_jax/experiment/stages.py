@@ -62,8 +62,7 @@ def check_settings(settings: Settings) -> None:
     for name in settings.evaluation.systems:
         choose(systems, name, "evaluation.systems entry")
     scales = (part(n) for n in (*sizes.values(), 3) for part in (jnp.zeros, jnp.ones))
-    space = Space(*scales)
-    model = build.build_model(settings.model, space, plant)
+    model = build.build_model(settings.model, Space(*scales), plant)
     if model.along_path != (law is not None):
         raise ValueError(
             "model.frame=path and dataset=path go together: "
@@ -115,11 +114,8 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
         # Whether logs are too few for the level is known before the training.
         if settings.logs:
             dataset, _ = data.ensure_dataset(settings)
-            count, level = (
-                len(dataset.calibration.controls),
-                settings.certification.level,
-            )
-            check_count(count, level, "calibration segments")
+            count = len(dataset.calibration.controls)
+            check_count(count, settings.certification.level, "calibration segments")
         with store.locked(settings.run_dir):
             runs.claim(settings)
             # Once more under the lock, where nobody else can be writing.
@@ -251,15 +247,14 @@ def certify_policy(settings: Settings) -> dict[str, Any]:
         document = _certify_tubes(settings, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
-    # The proof's own versions win: they are of the libraries that computed it.
-    versions = store.versions() | document.get("versions", {})
     document |= {
         "weights_sha256": trained.weights_sha256,
         "policy_sha256": trained.sha256,
         "certification": _asked_for(settings),
-        "versions": versions,
+        # The proof's own versions win: they are of the libraries that computed it.
+        "versions": store.versions() | document.get("versions", {}),
+        "seconds": time.perf_counter() - began,
     }
-    document["seconds"] = time.perf_counter() - began
     store.write_json(settings.certificate_path, document)
     verdict = f"refused: {document.get('reason')}"
     if document["valid"]:
@@ -335,9 +330,8 @@ def ensure_certificate(settings: Settings) -> None:
     with store.locked(settings.run_dir, wait=True):
         # Called in any case: it checks that the policy has these settings.
         ensure_policy(settings)
-        if settings.certificate_path.exists():
-            recorded = store.read_json(settings.certificate_path)
-            recorded = recorded.get("certification", {})
+        if (path := settings.certificate_path).exists():
+            recorded = store.read_json(path).get("certification", {})
             if not store.differences(recorded, _asked_for(settings)):
                 return
         certify_policy(settings)

@@ -254,11 +254,10 @@ def in_window(
     ) -> tuple[Any, Any, Any]:
         road, spacing, left, right, speed, *obstacles, moved = ahead
         scene = Lane(Road(road, spacing), left, right, speed), Obstacles(*obstacles)
-        # Along the window of this step.
-        index = state.committed.index - moved
         state = state._replace(
             progress=state.progress - spacing * moved,
-            committed=state.committed._replace(index=index),
+            # Along the window of this step.
+            committed=state.committed._replace(index=state.committed.index - moved),
         )
         return driver.act(params, state, observation, env, scene)
 

@@ -172,10 +172,9 @@ def _manifest(path: Path) -> dict[str, Any]:
     if manifest["format"] != FORMAT:
         found = f"is of format {manifest['format']}"
         raise ExportError(path, f"{found}, this file reads {FORMAT}")
-    recorded = manifest["sha256"]
     hashed = {name: value for name, value in manifest.items() if name != "sha256"}
     text = json.dumps(hashed, sort_keys=True)
-    if hashlib.sha256(text.encode()).hexdigest() != recorded:
+    if hashlib.sha256(text.encode()).hexdigest() != manifest["sha256"]:
         raise ExportError(path, "changed, its sha256 is not that of its content")
     return manifest
 
@@ -249,8 +248,7 @@ def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, Any]:
         ahead["speed"] = ahead["speed"] + speed
     line[:, 0] = spacing * np.arange(1, len(line) + 1)
     box = manifest["environment"]
-    env = np.mean([box["low"], box["high"]], axis=0)
-    return observation, env, ahead
+    return observation, np.mean([box["low"], box["high"]], axis=0), ahead
 
 
 if __name__ == "__main__":

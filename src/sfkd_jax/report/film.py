@@ -106,6 +106,8 @@ class Film:
         self.largest = max(shown) or LANE
         # The same widening for all cars, so that they compare.
         self.factor = int(np.clip(_HALF / self.largest, 1, _MOST))
+        self.path = np.asarray(cars[0].path)
+        self.near = [_nearest(np.asarray(one.states)[:, :2], self.path) for one in cars]
 
     def frames(self) -> Iterator[Image.Image]:
         """The frames."""
@@ -117,26 +119,14 @@ class Film:
         figure.set(figwidth=6.0, dpi=90)
         road = figure.add_axes((0.125, 1 - (tall + 0.29) / height, 0.86, tall / height))
         errors = figure.add_axes((0.125, 0.49 / height, 0.86, 1.16 / height))
-        self._draw_axes(road, errors)
-        points = np.asarray(self.cars[0].path)
-        near = [_nearest(np.asarray(one.states)[:, :2], points) for one in self.cars]
-
-        def draw(step: int) -> None:
-            self._draw_road(road, points, near, step)
-            self._draw_errors(errors, step)
-
-        return _each(figure, range(0, self.last, EVERY), draw)
-
-    def _draw_axes(self, road: Any, errors: Any) -> None:
-        """What no frame changes: scales, corridor, dashes at switches."""
+        # What no frame changes: scales, corridor, dashes at switches.
         bottom = -_SPACING * (len(self.cars) - 0.5)
-        road.set(xlim=(-_BEHIND, _AHEAD), ylim=(bottom, 0.5 * _SPACING))
-        road.set(aspect="equal")
+        road.set(xlim=(-_BEHIND, _AHEAD), ylim=(bottom, 0.5 * _SPACING), aspect="equal")
         road.set_axis_off()
         words = style.scenario_label(str(self.cars[0].row.get("scenario")))
         words = f"{style.literal(words)}, deviations × {self.factor}"
         road.set_title(words, fontsize=9.5, loc="right", pad=4)
-        dt, high = self.cars[0].dt, 1.5 * self.largest
+        dt, high = self.dt, 1.5 * self.largest
         if self.corridor:
             style.draw_corridor(errors, self.corridor)
         for switch in self.cars[0].switches:
@@ -147,51 +137,53 @@ class Film:
         errors.set_ylabel("deviation [m]")
         errors.spines[["top", "right"]].set_visible(False)
 
+        def draw(step: int) -> None:
+            self._draw_road(road, step)
+            self._draw_errors(errors, step)
+
+        return _each(figure, range(0, self.last, EVERY), draw)
+
     def _draw_errors(self, axes: Any, step: int) -> None:
         """Deviations up to a step."""
-        dt = self.cars[0].dt
-        time = dt * np.arange(1, step + 2)
+        time = self.dt * np.arange(1, step + 2)
         for car, values in zip(self.cars, self.deviations, strict=True):
             color = style.line(car.system)["color"]
             _put(axes, Line2D(time, values[: step + 1], color=color, linewidth=1.8))
         now = Line2D([time[-1]] * 2, axes.get_ylim(), color=style.SOFT, linewidth=0.8)
         _put(axes, now)
 
-    def _draw_road(self, axes: Any, path: Any, near: list[Any], step: int) -> None:
+    def _draw_road(self, axes: Any, step: int) -> None:
         """Every car on its copy of the road, seen from the first car after a step."""
         envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
         friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
         _put(axes, Rectangle((0, 0), 1, 1, fc=_surface(friction), **whole))
         for number in range(len(self.cars)):
-            self._draw_car(axes, path, near, step + 1, number)
+            self._draw_car(axes, step + 1, number)
         _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
         if envs is not None:
             words = f"friction {friction:.2g}, wind {round(wind):+d} m/s"
             _put(axes, Text(0, 1.02, words, fontsize=9.5, clip_on=False, **whole))
         _draw_wind(axes, wind, 0.93 * _AHEAD)
 
-    def _draw_car(
-        self, axes: Any, path: Any, near: list[Any], now: int, number: int
-    ) -> None:
+    def _draw_car(self, axes: Any, now: int, number: int) -> None:
         """One car on its copy of the road, its trail and its name."""
-        car, lateral, own = self.cars[number], self.deviations[number], near[number]
-        centre, states = path[near[0][now]], np.asarray(car.states)
+        car, lateral = self.cars[number], self.deviations[number]
+        own, first = self.near[number], int(self.near[0][now])
+        path, centre = self.path, self.path[first]
         color, shift = style.line(car.system)["color"], -_SPACING * number
 
         def seen(points: Any, offset: Any) -> np.ndarray:
             """Positions to the left of path points on this copy, (2, point)."""
             return _seen(centre, points, offset) + np.array([[0.0], [shift]])
 
-        around = path[max(int(near[0][now]) - 120, 0) : int(near[0][now]) + 160]
+        around = path[max(first - 120, 0) : first + 160]
         for side, dashes in ((-_HALF, "-"), (0.0, (0, (6, 5))), (_HALF, "-")):
             look: dict[str, Any] = {"color": "#aab1ba", "lw": 1.2, "ls": dashes}
             _put(axes, Line2D(*seen(around, side), **look))
         if self.corridor:
-            edges = [
-                seen(around, side * self.factor * self.corridor) for side in (1, -1)
-            ]
-            area = np.hstack([edges[0], edges[1][:, ::-1]]).T
-            _put(axes, Polygon(area, **style.BAND))
+            half = self.factor * self.corridor
+            edges = [seen(around, half), seen(around, -half)]
+            _put(axes, _between(*edges, **style.BAND))
             for edge in edges:
                 _put(axes, Line2D(*edge, **style.EDGE))
         # A car off its lane stays at the edge of its copy: beyond is another one's.
@@ -200,7 +192,8 @@ class Film:
         recent = slice(max(now - _TRAIL, 0), now + 1)
         trail = seen(path[own[recent]], offset[recent])
         _put(axes, Line2D(*trail, color=color, linewidth=1.8))
-        body = _turn_by(centre[2] - states[now, 2]) @ _CAR + trail[:, -1:]
+        yaw = np.asarray(car.states)[now, 2]
+        body = _turn_by(centre[2] - yaw) @ _CAR + trail[:, -1:]
         _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
         look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
@@ -248,8 +241,7 @@ class LaneFilm:
         ]
         about: dict[str, Any] = {"loc": "lower center", "ncols": 4, "frameon": False}
         figure.legend(handles=handles, fontsize=9, **about, columnspacing=1.4)
-        steps = range(0, self.last, EVERY)
-        return _each(figure, steps, partial(self._draw, axes))
+        return _each(figure, range(0, self.last, EVERY), partial(self._draw, axes))
 
     def _draw(self, axes: Any, step: int) -> None:
         """Road, obstacles, corridor and car at a step."""

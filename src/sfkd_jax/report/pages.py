@@ -57,12 +57,11 @@ def to_latex(captions: list[tuple[str, pd.DataFrame]]) -> str:
     text = "% Needs \\usepackage{booktabs}.\n"
     for caption, frame in captions:
         words = re.sub(r"([&%$#_{}])", r"\\\1", caption.replace("\\", "/"))
-        columns = "l" + "r" * frame.shape[1]
         text += frame.to_latex(
             escape=True,
             caption=words,
             position="p",
-            column_format=columns,
+            column_format="l" + "r" * frame.shape[1],
             multicolumn_format="c",
         )
     return text
@@ -79,17 +78,13 @@ def _as_html(part: Part, home: Path) -> str:
             source = f"data:image/png;base64,{data}"
         return f'<img alt="{html.escape(part.alt)}" src="{source}">'
     # Numbers stand below each other by their last digit, words begin on the left.
-    kind = "numbers" if _is_numeric(part) else "words"
+    digits = part.map(lambda cell: cell[:1] in "0123456789−–<").mean().mean()
+    kind = "numbers" if digits > 0.5 else "words"
     with pd.option_context("display.max_colwidth", None):
         rows = part.to_html(classes=kind, border=0, escape=True, justify="right")
     # The row of this project's model is marked.
     rows = re.sub(r"<tr>(\s*<th>SFKD</th>)", r'<tr class="strong">\1', rows)
     return f'<div class="scroll">{rows}</div>'
-
-
-def _is_numeric(frame: pd.DataFrame) -> bool:
-    """Whether most cells begin with a digit, a sign or a dash."""
-    return bool(frame.map(lambda cell: cell[:1] in "0123456789−–<").mean().mean() > 0.5)
 
 
 _ENVIRONMENT = Environment(

@@ -73,7 +73,8 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         images = empty_folder(home / "figures")
         _, policy = store.read_arrays(weights, kind="policy")
         settings = policy.get("config") or {}
-        system, experiment = tables.model_of(settings), settings.get("experiment")
+        model, experiment = settings.get("model"), settings.get("experiment")
+        system = str(dig(model, "system") or dig(model, "name") or "sfkd")
         title = f"{style.label(system)}, {plain(experiment or 'unnamed run')}"
         sections = _sections(run_dir, policy, images)
         return write_page(
@@ -269,13 +270,11 @@ def _results(
     for group in grouped(rows, _TABLE):
         # One table over all vehicles and scenarios: a group shares all that is left.
         title = title_of(group, _TABLE)
-        table = tables.cross_table(group, tables.rmse_cell)
-        if table is not None:
+        if (table := tables.cross_table(group, tables.rmse_cell)) is not None:
             sections.append(Section(title, [table]))
             captions.append((f"{title}. {tables.MARKS}", table))
         for metric in tables.shown_metrics():
-            table = tables.cross_table(group, metric.text)
-            if table is not None:
+            if (table := tables.cross_table(group, metric.text)) is not None:
                 head = f"{metric.head()}: {title}"
                 metrics.append(Section(head, [table], folded=True))
     for number, group in enumerate(grouped(rows, _FIGURE), 1):

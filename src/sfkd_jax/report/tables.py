@@ -108,12 +108,6 @@ def title_of(group: list[Row], columns: Iterable[str]) -> str:
     return text[:1].upper() + text[1:]
 
 
-def model_of(config: dict[str, Any]) -> str:
-    """Name of the system that settings train, as in results.json."""
-    model = config.get("model")
-    return str(dig(model, "system") or dig(model, "name") or "sfkd")
-
-
 def amount(rows: list[Row]) -> str:
     """How many episodes of which length, and from which seeds of the training."""
     known = [[row.get(key) for row in rows] for key in ("episodes", "episode_s")]

@@ -93,8 +93,7 @@ def in_view(course: Course, progress: Scalar) -> Obstacles:
         progress: arc length of the car [m].
     """
     ahead = course.along - progress
-    last = course.along.shape[0] - IN_VIEW
-    first = jnp.clip(jnp.sum(ahead < -PASSED), 0, last)
+    first = jnp.clip(jnp.sum(ahead < -PASSED), 0, course.along.shape[0] - IN_VIEW)
     present = course.obstacles.present & (ahead <= course.view)
     seen = course.obstacles._replace(present=present)
     # A window of constant size: a controller is compiled once for all courses.
