@@ -153,11 +153,15 @@ def from_logs(
     }
     for group, rows in covered.items():
         for name, row in rows.items():
-            ends = f"{row['low']:.4g} … {row['high']:.4g}"
-            middle = f"middle 99.8 % {row['low_998']:.4g} … {row['high_998']:.4g}"
-            visited = f"{round(10 * row['bins_visited'])} of 10 tenths visited"
-            report(f"coverage of {group} {name}: {ends}, {middle}, {visited}")
+            report(f"coverage of {group} {name}: {_told(row)}")
     return LoggedDataset(dataset, covered)
+
+
+def _told(row: dict[str, float]) -> str:
+    """The coverage of a channel, for a person."""
+    middle = f"middle 99.8 % {row['low_998']:.4g} … {row['high_998']:.4g}"
+    visited = f"{round(10 * row['bins_visited'])} of 10 tenths visited"
+    return f"{row['low']:.4g} … {row['high']:.4g}, {middle}, {visited}"
 
 
 def _repeats(checks: Checks, logs: list[Log]) -> Iterator[Finding]:

@@ -143,8 +143,7 @@ def simulate(
                 bend = curvature_ahead(follows)[0]
                 lateral = path_coordinates(state, follows[0], bend)[LATERAL]
         signals = {name: signal(info) for name, signal in wanted.items()}
-        recorded = (state, control, lateral, progress, signals)
-        return (state, progress, memory), recorded
+        return (state, progress, memory), (state, control, lateral, progress, signals)
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)

@@ -35,8 +35,7 @@ _SEARCH = ("controller", "planner", "sampling")
 def table(corner: str, columns: dict[Any, list[str]], names: list[str]) -> pd.DataFrame:
     """Text by column; `corner` is the head of the names of the rows."""
     frame = pd.DataFrame(columns, index=pd.Index(names), dtype=object)
-    levels = frame.columns.nlevels
-    return frame.rename_axis(columns=[*[""] * (levels - 1), corner])
+    return frame.rename_axis(columns=[*[""] * (frame.columns.nlevels - 1), corner])
 
 
 def record_table(corner: str, record: dict[str, Any], *heads: str) -> pd.DataFrame:
