@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmarks import arguments, write
 from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
+from benchmarks.recovery import LANE
 from sfkd_jax import build, plants, policy
-from sfkd_jax.evaluation import metrics
 from sfkd_jax.plants import equivalent_wind
 from sfkd_jax.scenarios import random_side_forces
 
@@ -132,9 +132,8 @@ def drive(car, system, scene):
     episodes = jax.jit(jax.vmap(driving(car.step, controller, params)))(made, keys)
     lateral = np.asarray(episodes.lateral, dtype=np.float64)
     largest = np.abs(lateral).max(axis=1)
-    margin = metrics.LANE_HALF_WIDTH - metrics.VEHICLE_HALF_WIDTH
     return {
-        "left_the_lane": int(np.sum(~(largest <= margin))),
+        "left_the_lane": int(np.sum(~(largest <= LANE))),
         "largest_mm": round(1e3 * float(largest.max()), 1),
         "rmse_mm": np.round(rmse_mm(lateral[:, SETTLED:]), 3).tolist(),
     }

@@ -207,10 +207,8 @@ def enemy_rows(car, drive, given):
     size = given.runs, 3 * base.course.along.shape[1]
     search(draw, size, given.generations, reward)
     least = min(one["smallest_clearance_m"] for one in found)
-    yield (
-        "enemy",
-        total(found) | {"smallest_clearance_m": least, "avoidable": sum(hits)},
-    )
+    whole = total(found) | {"smallest_clearance_m": least, "avoidable": sum(hits)}
+    yield "enemy", whole
 
 
 def time_rows(car, drive, given):

@@ -5,7 +5,6 @@ python -m benchmarks.pages    writes every block `<!-- NAME -->` … `<!-- end -
 
 import json
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,12 +113,9 @@ def shield():
             f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",
         ]
 
-    head = ["planner"]
+    head, inside = ["planner"], "largest distance, runs inside"
     for car in CARS:
-        head += [
-            f"{car}: left the lane, without → with",
-            "largest distance, runs inside",
-        ]
+        head += [f"{car}: left the lane, without → with", inside]
     kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
     return table(
         head,
@@ -172,31 +168,25 @@ def recovery():
         return f"{row['within_3s']:.1%}; {row['s_99'] or '–'} s"
 
     jumps, silent = ("jump", "alternating", "yaw"), ("frozen", "late", "lost")
+    brief = faults, "brief"
     cells = {
-        "starts that come back, law of the box alone → policy": partial(
-            starts, name="grid"
-        ),
-        "the same, random to 20 m, any yaw, S3 roads": partial(
-            starts, name="random starts"
-        ),
-        "pose jumps to 2 s: largest distance; departures; back": lambda car: faults(
-            car, "brief", *jumps
-        ),
-        "frozen, late, lost to 2 s": lambda car: faults(car, "brief", *silent),
-        "either, for 5 s": lambda car: faults(car, "5 s", *jumps, *silent),
-        "full braking from 10 m/s, friction 0.7 [m]; unfiltered": partial(
-            stop, friction=0.7
-        ),
-        "the same, friction 0.3": partial(stop, friction=0.3),
-        "steering 1° off: found in 3 s; 99 % found after": partial(found, way="law"),
-        "the same, ν of the class": partial(found, way="class"),
-        "steps beyond the distance that `info` claims": beyond,
-        "runs under the conditions with a flag; steps": flagged,
+        "starts that come back, law of the box alone → policy": (starts, "grid"),
+        "the same, random to 20 m, any yaw, S3 roads": (starts, "random starts"),
+        "pose jumps to 2 s: largest distance; departures; back": (*brief, *jumps),
+        "frozen, late, lost to 2 s": (*brief, *silent),
+        "either, for 5 s": (faults, "5 s", *jumps, *silent),
+        "full braking from 10 m/s, friction 0.7 [m]; unfiltered": (stop, 0.7),
+        "the same, friction 0.3": (stop, 0.3),
+        "steering 1° off: found in 3 s; 99 % found after": (found, "law"),
+        "the same, ν of the class": (found, "class"),
+        "steps beyond the distance that `info` claims": (beyond,),
+        "runs under the conditions with a flag; steps": (flagged,),
     }
-    return table(
-        ["outside the box", *CARS],
-        [[name, *(cell(car) for car in CARS)] for name, cell in cells.items()],
-    )
+    lines = [
+        [name, *(cell(car, *about) for car in CARS)]
+        for name, (cell, *about) in cells.items()
+    ]
+    return table(["outside the box", *CARS], lines)
 
 
 def timing():
@@ -277,7 +267,6 @@ def wide():
     about = [
         read(PRETRAINED / f"{car}_path/certificate.json")["corridor"] for car in CARS
     ]
-    groups = list(about[0]["by_group"])
     lines = [
         ["corridor [m]", *(f"{one['corridor_m']:.3f}" for one in about)],
         *(
@@ -285,7 +274,7 @@ def wide():
                 f"fresh runs inside: {group.replace('_', ' ')}",
                 *(f"{one['by_group'][group]['coverage']:.3f}" for one in about),
             ]
-            for group in groups
+            for group in about[0]["by_group"]
         ),
         ["S3", *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about)],
     ]

@@ -19,7 +19,6 @@ from scipy.signal import lfilter
 
 from benchmarks import arguments, device, write
 from benchmarks.device import CARS, HORIZON, NOISE, PERIOD
-from benchmarks.device import SHIPPED as SHIPPED
 from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.geometry import LATERAL, wrap_angle
@@ -100,13 +99,10 @@ class Car:
         self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
         self.states = len(self.loaded.vehicle.state_names)
         self.noise = np.asarray(NOISE[: self.states], np.float32)
-        self.policy = self.program(self.make_policy)
+        # The loaded controller needs no request.
+        self.policy = self.program(lambda _: self.loaded.controller)
         self.guarded = self.program(partial(self.asking, guard=True))
         self.bare = self.program(partial(self.asking, guard=False))
-
-    def make_policy(self, now):
-        """The loaded controller, which needs no request."""
-        return self.loaded.controller
 
     def asking(self, now, *, guard):
         """A request of `KINDS` in the world, inside the policy's guard or without it."""
@@ -121,8 +117,7 @@ class Car:
     def program(self, make):
         """(runs) -> what is recorded of every call, (run, time, …)."""
         part = jax.jit(jax.vmap(partial(part_of_run, self, make)))
-        nothing = Now(*[0] * len(Now._fields))
-        begin = jax.jit(jax.vmap(lambda seed: make(nothing).init(jax.random.key(seed))))
+        begin = jax.jit(jax.vmap(lambda seed: make(None).init(jax.random.key(seed))))
 
         def batch(runs, rows):
             runs = jax.tree.map(lambda leaf: leaf[rows], runs)
@@ -173,8 +168,7 @@ def part_of_run(car, make, runs, carry):
         fresh = jax.random.normal(jax.random.fold_in(key, number), state.shape)
         past = jnp.concatenate([(state + car.noise * fresh)[None], past[:-1]])
         shift = geometry.rotate(yaw, now.offset[:2])
-        wrong = jnp.concatenate([shift, now.offset[2:], now.body])
-        seen = past[now.lag] + wrong
+        seen = past[now.lag] + jnp.concatenate([shift, now.offset[2:], now.body])
         seen = jnp.where(now.lost, jnp.nan, seen)
         acted, memory, info = make(now).act(
             car.loaded.params, memory, seen, now.told, ahead
@@ -183,20 +177,15 @@ def part_of_run(car, make, runs, carry):
         after = jax.lax.fori_loop(
             0, TICKS, lambda _, x: car.step(x, turned, now.env), state
         )
-        flags = {
-            name: leaf
-            for name, leaf in info.items()
-            if jnp.shape(leaf) == () and jnp.result_type(leaf) == jnp.bool_
-        }
         recorded = {
             "left": left - now.aside,
             "turned": wrap_angle(state[2] - yaw),
             "along": foot,
             "state": state,
-            "corridor": info.get("corridor", jnp.nan),
-            "healthy": flags["healthy"] & flags.get("shield_healthy", True),
-            "flags": flags,
+            "healthy": info["healthy"] & info.get("shield_healthy", True),
         }
+        of_guard = {"corridor", "innovation_alarm"} & info.keys()
+        recorded |= {name: info[name] for name in of_guard}
         return (number + 1, after, foot, memory, past), recorded
 
     return jax.lax.scan(step, carry, runs.now)
@@ -241,20 +230,15 @@ def runs_on(car, road, steps, seed, *, foot=0.0, beside=(), **now):
     )
     foot = np.asarray(foot + np.zeros(count), np.float32)
     here = points[np.arange(count), np.round(foot / SPACING).astype(int)]
-    usual = (0.0, 0.0, filled.speed[:, 0])
+    usual = (0.0, 0.0, filled.speed[:, 0], *np.zeros(car.states - 4))
     left, turned, speed, *body = (*beside, *usual[len(beside) :])
     start = np.zeros((count, car.states), np.float32)
     start[:, 0] = here[:, 0] - left * np.sin(here[:, 2])
     start[:, 1] = here[:, 1] + left * np.cos(here[:, 2])
     start[:, 2], start[:, 3] = here[:, 2] + turned, speed
-    start[:, 4:] = np.zeros((count, car.states - 4)) if not body else np.transpose(body)
-    return Runs(
-        start=start,
-        foot=foot,
-        road=points.astype(np.float32),
-        seed=np.arange(count) + 1000 * seed,
-        now=filled,
-    )
+    start[:, 4:] = np.transpose(body)
+    seeds = np.arange(count) + 1000 * seed
+    return Runs(start, foot, road=points.astype(np.float32), seed=seeds, now=filled)
 
 
 def driven(drive, parts):
@@ -308,15 +292,16 @@ def returned(made, runs):
 
 def claimed(made, corridor):
     """Steps outside the certified corridor, of them healthy; beyond a claim."""
-    far, healthy, claims = distance(made), made["healthy"], made["corridor"]
+    far, healthy = distance(made), made["healthy"]
     whole = {
         "runs": len(far),
         "departures": int((far > DEPARTED).any(axis=1).sum()),
         "largest_m": shown(far.max()),
     }
     # Without a guard nothing is claimed.
-    if "shield_healthy" not in made["flags"]:
+    if "corridor" not in made:
         return whole
+    claims = made["corridor"]
     return whole | {
         "steps": far.size,
         "outside": int((far > corridor).sum()),
@@ -462,21 +447,17 @@ def deceptions(steps):
         "yaw bias 0.03 rad": {"offset": 0.03 * yaw},
         "reference moves 0.1 m": {"aside": side},
         "NaN for good": {"lost": time_[:, 0] >= 5.0},
+        "steering offset 3.0 degrees": {"steering": np.deg2rad(3.0)},
     }
-    made["steering offset 3.0 degrees"] = {"steering": np.deg2rad(3.0)}
     return made | {f"position bias {b} m": {"offset": b * left} for b in (0.05, 0.15)}
 
 
 def in_class(car, many, seed=6):
     """Runs under the conditions of the certificate."""
     about = car.loaded.certificate["corridor"]["conditions"]
-    limits = {name: about[name] for name in scenarios.DriveClass._fields}
-    drive = partial(
-        scenarios.random_drive,
-        limits=scenarios.DriveClass(**limits),
-        steps=LONGEST,
-        dt=PERIOD,
-    )
+    limits = scenarios.DriveClass(*(about[x] for x in scenarios.DriveClass._fields))
+    length = {"steps": LONGEST, "dt": PERIOD}
+    drive = partial(scenarios.random_drive, limits=limits, **length)
     keys = jax.random.split(jax.random.key(seed), many)
     groups = jnp.arange(many) % len(scenarios.DRIVES)
     speeds, turns = map(np.asarray, jax.jit(jax.vmap(drive))(keys, groups))
@@ -485,14 +466,9 @@ def in_class(car, many, seed=6):
         np.interp(SPACING * np.arange(POINTS), *one)
         for one in zip(along, turns, strict=True)
     ]
-    switching = partial(
-        scenarios.random_switching,
-        steps=LONGEST,
-        dt=PERIOD,
-        low=about["env_box"][0],
-        high=about["env_box"][1],
-        dwell=about["dwell_s"],
-    )
+    low, high = about["env_box"]
+    box = {"low": low, "high": high, "dwell": about["dwell_s"]}
+    switching = partial(scenarios.random_switching, **length, **box)
     road = roads(many, seed, switching, np.stack(bends))
     return runs_on(car, road, LONGEST, seed, speed=speeds)
 
@@ -517,21 +493,19 @@ def detection_rows(car, most):
     change = runs.now.steering + change * random.choice((-1, 1), (many, 1))
     law = runs.now._replace(steering=change.astype(REAL))
     for way, now in (("law", law), ("class", law._replace(nu=nu))):
-        alarm = car.guarded(runs._replace(now=now))["flags"]["innovation_alarm"]
+        alarm = car.guarded(runs._replace(now=now))["innovation_alarm"]
         found = alarm[:, ONSET + 1 :]
         late = PERIOD * (np.argmax(found, axis=1) + 1.0)
         late = np.where(found.any(axis=1), late, np.inf)
         half, most_ = np.quantile(late, (0.5, 0.99), method="inverted_cdf")
-        yield (
-            f"steering offset 1.0 degrees, {way}",
-            {
-                "before": int(alarm[:, : ONSET + 1].any(axis=1).sum()),
-                "runs": len(late),
-                "within_3s": shown((late < 3.05).mean(), 4),
-                "s_50": shown(half, 1),
-                "s_99": shown(most_, 1),
-            },
-        )
+        row = {
+            "before": int(alarm[:, : ONSET + 1].any(axis=1).sum()),
+            "runs": len(late),
+            "within_3s": shown((late < 3.05).mean(), 4),
+            "s_50": shown(half, 1),
+            "s_99": shown(most_, 1),
+        }
+        yield f"steering offset 1.0 degrees, {way}", row
 
 
 def table_rows(car, most):

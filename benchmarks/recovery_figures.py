@@ -5,8 +5,6 @@
 Writes docs/recovery.png from recovery.json, and docs/recovery.gif from two runs.
 """
 
-from pathlib import Path
-
 import jax
 import numpy as np
 from matplotlib.colors import ListedColormap
@@ -59,5 +57,5 @@ def jump(path):
 
 
 if __name__ == "__main__":
-    style.save(Path(ROOT / "docs" / "recovery.png"), basin)
+    style.save(ROOT / "docs" / "recovery.png", basin)
     jump(ROOT / "docs" / "recovery.gif")

@@ -27,6 +27,8 @@ NOISE, TEMPERATURE, EFFORT = 0.4, 1.0, 0.01
 LOW, HIGH = -2.0, 2.0
 SAMPLES, HORIZON, WARM_UP = 1500, 20, 9
 TARGET = np.zeros(OUTPUTS, np.float32)
+START = np.random.default_rng(1).normal(size=RANK).astype(np.float32)
+"""The latent state at the first step."""
 PACKAGES = ("jax", "torch", "pytorch_mppi", "jax_mppi")
 
 
@@ -64,11 +66,6 @@ def charge(xp, w, z, u, target):
     """The cost of arriving at z by u, likewise."""
     y = xp.tanh(xp.tanh(z @ w["D1"].T) @ w["D2"].T) @ w["D3"].T
     return xp.sum((y - target) ** 2, -1) + EFFORT * xp.sum(u**2, -1)
-
-
-def start():
-    """The latent state at the first step."""
-    return np.random.default_rng(1).normal(size=RANK).astype(np.float32)
 
 
 def on_device():
@@ -219,15 +216,14 @@ CONTENDERS = {
 def measure(name, steps):
     """Seconds to the first answer, then the time of every warm step [ms]."""
     began = time.perf_counter()
-    step, z = CONTENDERS[name](), start()
-    step(z, TARGET)
+    step = CONTENDERS[name]()
+    step(START, TARGET)
     first, times = time.perf_counter() - began, []
-    for number in range(WARM_UP + steps):
+    for _ in range(WARM_UP + steps):
         began = time.perf_counter()
-        step(z, TARGET)
-        if number >= WARM_UP:
-            times.append(1e3 * (time.perf_counter() - began))
-    return {"first_s": first, "times_ms": times}
+        step(START, TARGET)
+        times.append(1e3 * (time.perf_counter() - began))
+    return {"first_s": first, "times_ms": times[WARM_UP:]}
 
 
 def in_own_process(name, steps):
@@ -260,16 +256,15 @@ def main():
             continue
         medians = [statistics.median(one["times_ms"]) for one in found]
         every = np.concatenate([one["times_ms"] for one in found])
-        rows.append(
-            {
-                "contender": name,
-                "best_ms": round(min(medians), 2),
-                "median_ms": round(statistics.median(medians), 2),
-                "p99_ms": round(float(np.quantile(every, 0.99)), 2),
-                "first_s": round(statistics.median(one["first_s"] for one in found), 2),
-            }
-        )
-        print(rows[-1])
+        row = {
+            "contender": name,
+            "best_ms": round(min(medians), 2),
+            "median_ms": round(statistics.median(medians), 2),
+            "p99_ms": round(float(np.quantile(every, 0.99)), 2),
+            "first_s": round(statistics.median(one["first_s"] for one in found), 2),
+        }
+        rows.append(row)
+        print(row)
     print(left_out)
     document = {
         "cores": len(os.sched_getaffinity(0)),

@@ -12,13 +12,12 @@ import sys
 import time
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path.append(str(HERE.parent / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
-from exact import search  # noqa: E402  the tests run the same search with fewer cases
+from exact import search  # The tests run the same search with fewer cases.
 
-from benchmarks import arguments  # noqa: E402
-from sfkd_jax import store  # noqa: E402
+from benchmarks import arguments
+from sfkd_jax import store
 
 if __name__ == "__main__":
     given = arguments(__doc__, __file__, cases=200_000, seed=1)

@@ -25,9 +25,7 @@ FRICTIONS = (0.9, 0.6, 0.3)
 def drivers():
     """Row -> (controller, parameters); all observe the states of our dynamic car."""
     directory = SHIPPED / "dynamic_path"
-    trained, world = (
-        policy.restore(SHIPPED / name) for name in ("dynamic_path", "dynamic")
-    )
+    trained, world = map(policy.restore, (directory, SHIPPED / "dynamic"))
     ours, along = trained.vehicle, dict(trained.settings["controller"], shield=False)
     box = {
         f"env_{side}": trained.settings["environment"][side] for side in ("low", "high")
@@ -35,12 +33,10 @@ def drivers():
     planner = partial(build.build_controller, plant=ours, law=trained.law)
     bicycle = build.reference_systems(ours)["nominal"]
     path = build.reference_systems(ours, trained.law)["nominal"]
+    in_world = build.build_controller(world.settings["controller"], bicycle.model, ours)
     adaptive = sfkd_jax.load(directory, controller=along | {"adaptive": True})
     return {
-        "nominal": (
-            build.build_controller(world.settings["controller"], bicycle.model, ours),
-            bicycle.params,
-        ),
+        "nominal": (in_world, bicycle.params),
         "nominal, along the path": (planner(along, path.model), path.params),
         "SFKD": (planner(along, trained.model, **box), trained.params),
         "SFKD, adaptive": (adaptive.controller, adaptive.params),
@@ -91,9 +87,8 @@ def main():
         for label, driver in drivers().items():
             began = time.perf_counter()
             halves = drive(car, *driver, track)
-            print(
-                f"{name}: {label}: {time.perf_counter() - began:.0f} s", file=sys.stderr
-            )
+            spent = time.perf_counter() - began
+            print(f"{name}: {label}: {spent:.0f} s", file=sys.stderr)
             for friction, first, second in zip(FRICTIONS, *halves, strict=True):
                 row = {"car": name, "row": label, "friction": friction}
                 row |= {"first_half_mm": first.tolist()}
