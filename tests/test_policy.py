@@ -228,11 +228,8 @@ def test_a_policy_drives_on_earth_as_it_does_at_the_origin(vehicle):
             turned = points[..., :2] @ turn + far
             return np.concatenate([turned, points[..., 2:3] + yaw, points[..., 3:]], -1)
 
-        x, state, errors = (
-            start(vehicle).at[1].set(0.25),
-            trained.controller.init(KEY),
-            [],
-        )
+        x, state = start(vehicle).at[1].set(0.25), trained.controller.init(KEY)
+        errors = []
         for k in range(25):
             ahead = np.add(straight(20), [float(k), 0.0, 0.0, 0.0])
             seen, ahead, _ = convert(away(x), away(ahead))

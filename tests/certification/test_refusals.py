@@ -1,7 +1,6 @@
 """Models that must not be certified are refused, with the reason."""
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, certified, jit, model_and_params
 
 import sfkd_jax
+from sfkd_jax import demo
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
@@ -104,8 +104,7 @@ def test_certificates_that_ship_survive_other_roundings(car, monkeypatch):
         return jax.tree.map(rounded, exported(*about))
 
     monkeypatch.setattr(_verification, "exported", served)
-    home = Path(sfkd_jax.__file__).parent / "pretrained" / f"{car}_path"
-    assert sfkd_jax.load(home).certificate
+    assert sfkd_jax.load(demo.SHIPPED / f"{car}_path").certificate
 
 
 # --- attacks --------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """The safety filter: what passes, what it guarantees, and what it reports."""
 
 from functools import cache, partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -11,14 +10,13 @@ import pytest
 from helpers import any_law, jit, tiny
 
 import sfkd_jax
-from sfkd_jax import build, control, scenarios
+from sfkd_jax import build, control, demo, scenarios
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.plants import kinematic
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
 
-SHIPPED = Path(sfkd_jax.__file__).parent / "pretrained"
 LAW = any_law()
 ENV = jnp.asarray([0.6, 2.0])
 LOW, HIGH = (-0.4, -5.0), (0.4, 5.0)
@@ -657,7 +655,7 @@ class _Timed(NamedTuple):
 @pytest.mark.parametrize("car", ["dynamic", "kinematic"])
 def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(car):
     """From 10 m/s at 2.5 m/s², in S3's schedule, with sensor noise and a hard planner."""
-    policy = sfkd_jax.load(SHIPPED / f"{car}_path")
+    policy = sfkd_jax.load(demo.SHIPPED / f"{car}_path")
     plant, law, count = policy.vehicle, policy.law, len(policy.vehicle.state_names)
 
     def follows(params, memory, xi, env, preview):

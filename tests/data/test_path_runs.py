@@ -29,11 +29,8 @@ def runs():
 
 
 def test_roads_speeds_and_perturbations_are_as_asked(runs):
-    nu, curvature, speed = (
-        runs.controls[..., :2],
-        runs.controls[..., 2],
-        runs.controls[..., 3],
-    )
+    given = runs.controls
+    nu, curvature, speed = given[..., :2], given[..., 2], given[..., 3]
     assert runs.states.shape == (64, 31, 6)
     assert runs.controls.shape == (64, 30, 4)
     assert not np.any(np.asarray(runs.states[..., POSE]))

@@ -172,10 +172,8 @@ def test_the_model_and_its_linear_predictor_are_one_on_a_straight_path():
     @jit
     def both(params, state, control, env):
         fiber = model.fiber(params, env)
-        linear, latent = (
-            model.structure.linear(fiber),
-            model.step(fiber, model.encode(fiber, state), control),
-        )
+        linear = model.structure.linear(fiber)
+        latent = model.step(fiber, model.encode(fiber, state), control)
         start = linear.lift(state.at[POSE].set(0.0))
         path = linear.C @ (linear.A @ start + linear.B @ control + linear.c) + linear.o
         return model.decode(fiber, latent), path.at[POSE].set(

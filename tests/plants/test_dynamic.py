@@ -44,13 +44,10 @@ def linearised(dynamic_plant, request):
     """The Jacobian of (v_y, yaw rate, steering) in straight driving at each of SPEEDS."""
 
     def of(which):
-        states, env = (
-            jax.vmap(straight)(jnp.asarray(SPEEDS)),
-            jnp.array([request.param, 0.0]),
-        )
-        return _jacobian(getattr(dynamic_plant(), which))(states, jnp.zeros(2), env)[
-            :, DRIVING, DRIVING
-        ]
+        at = jax.vmap(straight)(jnp.asarray(SPEEDS)), jnp.zeros(2)
+        env = jnp.array([request.param, 0.0])
+        rates = _jacobian(getattr(dynamic_plant(), which))(*at, env)
+        return rates[:, DRIVING, DRIVING]
 
     return of
 
@@ -66,10 +63,8 @@ def test_the_linearisation_in_straight_driving_is_the_linear_single_track(linear
     np.testing.assert_allclose(
         linearised("derivative")[rolling], theory, rtol=1e-12, atol=1e-12
     )
-    sampled, expected = (
-        np.linalg.eigvals(linearised("step")[rolling]),
-        np.linalg.eigvals(expm(0.1 * theory)),
-    )
+    sampled = np.linalg.eigvals(linearised("step")[rolling])
+    expected = np.linalg.eigvals(expm(0.1 * theory))
     gap = np.abs(expected[:, :, None] - sampled[:, None, :])
     assert max(gap.min(axis=1).max(), gap.min(axis=2).max()) < 5e-3
 

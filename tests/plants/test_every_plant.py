@@ -142,10 +142,8 @@ def test_a_car_launches_from_rest_along_the_kinematic_curve(vehicle, hold):
     assert jnp.isfinite(states).all()
     assert (jnp.diff(states[:, 3]) > 0).all()
     late = states[10:]
-    turned, gone = (
-        jnp.diff(late[:, 2]),
-        jnp.linalg.norm(jnp.diff(late[:, :2], axis=0), axis=1),
-    )
+    turned = jnp.diff(late[:, 2])
+    gone = jnp.linalg.norm(jnp.diff(late[:, :2], axis=0), axis=1)
     np.testing.assert_allclose(
         turned / gone, np.tan(steering) / vehicle.wheelbase, rtol=0.06
     )

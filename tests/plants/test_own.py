@@ -26,11 +26,8 @@ def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch)
     plants.check_step(plant)
     from own_vehicle import step
 
-    state, control, env = (
-        jnp.asarray([1.0, 2.0, 0.3, 4.0, 0.1]),
-        jnp.asarray([0.2, 0.5]),
-        jnp.asarray([0.7, 3.0]),
-    )
+    state = jnp.asarray([1.0, 2.0, 0.3, 4.0, 0.1])
+    control, env = jnp.asarray([0.2, 0.5]), jnp.asarray([0.7, 3.0])
     np.testing.assert_array_equal(
         plant.step(state, control, env), step(state, control, env)
     )

@@ -18,11 +18,9 @@ def axle_stiffness(vehicle, friction):
     """The stiffness of both axles [N/rad], proportional to μ in the kinematic plant
     only.
     """
-    return (
-        (6.0e4 * friction, 7.0e4 * friction)
-        if vehicle.name == "kinematic"
-        else (9.0e4, 1.05e5)
-    )
+    if vehicle.name == "kinematic":
+        return 6.0e4 * friction, 7.0e4 * friction
+    return 9.0e4, 1.05e5
 
 
 def understeer(front, rear):
