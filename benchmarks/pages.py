@@ -195,10 +195,8 @@ def timing():
     policies = [about["policies"]["dynamic_path"] for about in devices.values()]
 
     def case(step):
-        words = f"{step['samples']} x {step['horizon']}"
-        if step["vehicles"] > 1:
-            words += f", {step['vehicles']} vehicles, {step['at_once']} at once"
-        return words
+        cars = f", {step['vehicles']} cars, {step['at_once']} at once"
+        return f"{step['samples']}×{step['horizon']}{cars * (step['vehicles'] > 1)}"
 
     def size(step):
         vehicles = step["vehicles"], step["at_once"]
@@ -216,10 +214,11 @@ def timing():
             f"{each[-1]['memory_mib']:.1f}",
         ]
         for each in steps
+        if each[0]["samples"] not in (1024, 4096) and each[0]["vehicles"] != 16
     ]
     many = [f"{one['s3']['steps_per_s']:.0f}" for one in policies]
     lines.append(["simulated steps per second, many episodes", *many, ""])
-    return table(["samples x steps; ms a vehicle", *devices, "memory [MiB]"], lines)
+    return table(["samples×steps; ms a car", *devices, "memory [MiB]"], lines)
 
 
 def adaptation():

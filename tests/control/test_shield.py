@@ -185,7 +185,7 @@ def test_without_the_filter_the_same_planners_leave_the_corridor():
 
 
 def test_who_asks_for_little_is_left_alone():
-    """Bit for bit."""
+    """Up to the rounding of another program."""
     script, reference = jnp.tile(0.05 * jnp.asarray(LIMIT), (40, 1)), circle()
     xi, controls, info = jit(partial(drive, filtered()))(
         script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0)
@@ -197,7 +197,7 @@ def test_who_asks_for_little_is_left_alone():
             lambda xi: planner.act(script, memory, vehicle_state(xi), ENV, reference)[0]
         )
     )(xi)
-    np.testing.assert_array_equal(controls, planned)
+    np.testing.assert_allclose(controls, planned, rtol=1e-6)
     np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
     assert not np.any(info["intervention"])
     # Of bounds that are not the vehicle's own nothing is claimed, and all is driven.

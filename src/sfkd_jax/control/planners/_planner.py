@@ -18,7 +18,6 @@ from sfkd_jax.control.tasks._task import (
     RolloutSetup,
     Sample,
     StepIndex,
-    StepResult,
     Task,
 )
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
@@ -286,7 +285,7 @@ class Planner(Stateful):
         # Axis of the samples in one step, and in arrays of all steps.
         axis, along_steps = (-1, -1) if short else (0, 1)
 
-        def judge(before: Any, after: StepResult, target: Any, at: StepIndex) -> Any:
+        def judge(before: Any, after: Any, target: Any, at: StepIndex) -> Any:
             cost, worst, seen = after.cost, None, (after.state, after.control)
             if task.cost is not None:
                 pair = before._replace(latent=()), Sample((), *seen)
