@@ -135,6 +135,8 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
             f"got {parameters}"
         )
     system, coordinates = inner.sys, inner.sys.q_size()
+    # The environment acts once per several steps of the physics.
+    frames = round(float(inner.dt) / float(system.opt.timestep))
 
     def step(state: State, control: Control, env: Environment) -> State:
         # The same system with scaled fields; nothing is compiled anew for another e.
@@ -149,8 +151,7 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         moment, _ = jax.lax.scan(
             lambda moment, _: (pipeline.step(changed, moment, control), None),
             pipeline.init(changed, q, qd),
-            # The environment acts once per several steps of the physics.
-            length=round(float(inner.dt) / float(system.opt.timestep)),
+            length=frames,
         )
         return _state(moment)
 
