@@ -82,18 +82,20 @@ class SamplingPlanner(Planner):
         # A product for white noise too: without one, XLA draws numbers one by one where
         # they are scaled. In full precision: accelerators round factors to ten bits.
         table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
-        noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
-        return noise * std[None, None]
+        return jnp.einsum("tk,kmc->tmc", table, white, precision=exact) * std
 
 
 def spread(noise: Plans) -> Plans:
     """Return noise whose samples are spread over devices, and so are its rollouts.
 
-    If the program is traced under `jax.set_mesh` of a mesh with an axis `DEVICES`, of
-    type `jax.sharding.AxisType.Auto`.
+    If the program is traced under `jax.set_mesh` of a mesh with an axis `DEVICES`.
     """
-    if DEVICES not in jax.sharding.get_abstract_mesh().axis_names:
+    mesh = jax.sharding.get_abstract_mesh()
+    kinds = dict(zip(mesh.axis_names, mesh.axis_types, strict=True))
+    if DEVICES not in kinds:
         return noise
+    if kinds[DEVICES] != jax.sharding.AxisType.Auto:
+        raise ValueError(f"the mesh's axis {DEVICES!r} must be of type AxisType.Auto")
     axes = jax.sharding.PartitionSpec(None, DEVICES)
     return jax.lax.with_sharding_constraint(noise, axes)
 

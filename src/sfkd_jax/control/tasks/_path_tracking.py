@@ -190,9 +190,8 @@ class LawTask:
         """Return the cost of one step."""
         errors_before, errors, speed = self.errors(before, after, target)
         controls = after.control, before.control
-        cost = self.cost.stage(
-            weights, StageInputs(errors, errors_before, *controls, speed)
-        )
+        stage = StageInputs(errors, errors_before, *controls, speed)
+        cost = self.cost.stage(weights, stage)
         return cost * (1.0 + self.terminal_weight * at.last)
 
     def box(self) -> tuple[Control, Control]:

@@ -146,9 +146,8 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
     ends = low, high, dt * np.asarray(rate, float)
     bottom, top, most = (jnp.asarray(end, dtype=float) for end in ends)
 
-    def entry(
-        wanted: Scalar, before: Scalar, bottom: Scalar, top: Scalar, most: Scalar
-    ) -> Scalar:
+    def entry(wanted: Scalar, before: Scalar, *ends: Scalar) -> Scalar:
+        bottom, top, most = ends
         # An actuator outside its box returns to it at once, whatever its slew limit.
         before = jnp.clip(before, bottom, top)
         low, high = before - most, before + most
