@@ -82,7 +82,8 @@ class SamplingPlanner(Planner):
         # A product for white noise too: without one, XLA draws numbers one by one where
         # they are scaled. In full precision: accelerators round factors to ten bits.
         table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
-        return jnp.einsum("tk,kmc->tmc", table, white, precision=exact) * std
+        noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
+        return noise * std[None, None]
 
 
 def spread(noise: Plans) -> Plans:
