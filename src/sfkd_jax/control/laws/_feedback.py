@@ -121,8 +121,8 @@ def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, ...]:
     much to turn, one that is 0 in the box `NEAR` and 1 from twice its size on, and the
     curvature that the grip allows [1/m].
     """
-    off = [jnp.abs(errors[entry]) / NEAR[entry] for entry in range(len(NEAR))]
-    far = reduce(jnp.maximum, off) - 1.0
+    shares = [jnp.abs(errors[entry]) / NEAR[entry] for entry in range(len(NEAR))]
+    far = reduce(jnp.maximum, shares) - 1.0
     aside, steering = jnp.abs(errors[LATERAL]), turn.gain[0]
     # A law that does not steer has no approach.
     slope = steering[LATERAL] / jnp.maximum(steering[HEADING], 1e-6)

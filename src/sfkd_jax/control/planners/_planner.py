@@ -294,8 +294,9 @@ class Planner(Stateful):
                 every = task.constraint(tuning.constraints, *seen, target, at)
                 # NaN compares as kept, so it must not get through.
                 worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
-            parts = after.control, after.perturbation, after.state
-            return Evaluated(cost, *parts, worst)
+            return Evaluated(
+                cost, after.control, after.perturbation, after.state, worst
+            )
 
         def body(before: Any, inputs: Any) -> Any:
             after = task.step(tuning.cost, setup.context, before, *inputs)
@@ -330,10 +331,12 @@ class Planner(Stateful):
             lambda leaf: jnp.swapaxes(leaf, 0, 1),
             in_batches(together, jnp.swapaxes(plans, 0, 1), size=size),
         )
-        worst = along.violations
+        worst, ones = along.violations, jnp.ones(self.horizon, along.costs.dtype)
+        # A product: a sum would be one loop with the costs that it is over. In full
+        # precision: accelerators round factors to ten bits.
+        exact = jax.lax.Precision.HIGHEST
         return along._replace(
-            # A product: a sum would be one loop with the costs that it is over.
-            costs=jnp.ones(self.horizon) @ along.costs,
+            costs=jnp.matmul(ones, along.costs, precision=exact),
             violations=None if worst is None else jnp.max(worst, axis=0),
         )
 

@@ -109,8 +109,8 @@ class Task(NamedTuple):
             precise, or None where there are none; raises a ValueError that
             names an argument of the wrong shape.
         cost: (weights, sample before, sample after, target, step index) -> cost of a
-            step, from samples without latents. Evaluated for all steps at once, which
-            is faster than in `step`; None if `step` gives it.
+            step, from samples without latents. Short states are charged for all steps
+            at once, which is faster than in `step`; None if `step` gives it.
         constraint: see `constrained`; None for no constraint.
         constraint_data: that the constraint is given.
     """
