@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import at, driven, jit, model_and_params
 
-from sfkd_jax.rollout import defects, fibers_along, in_batches
+from sfkd_jax.rollout import fibers_along, in_batches, predictions, rollout
 
 
 @pytest.fixture(scope="module")
@@ -20,21 +20,20 @@ def run(function, name, trajectory):
 
 
 def test_the_true_plant_as_a_model_has_no_defects(one):
-    gaps, predicted = run(defects, "oracle", one)
-    np.testing.assert_allclose(gaps, jnp.zeros_like(gaps), rtol=0, atol=2e-6)
-    np.testing.assert_allclose(predicted, one.states[1:], rtol=0, atol=2e-6)
+    known = run(predictions, "oracle", one)
+    np.testing.assert_allclose(known.defects, 0.0 * known.defects, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(known.single, one.states[1:], rtol=0, atol=2e-6)
 
 
 def test_fibers_are_those_of_each_step_and_of_the_one_after(one):
-    now, later = run(
-        fibers_along, "oracle", one
-    )  # the fiber of a physics model is e itself
+    # The fiber of a physics model is e itself.
+    now, later = run(fibers_along, "oracle", one)
     np.testing.assert_array_equal(now, one.envs)
     np.testing.assert_array_equal(later[:-1], one.envs[1:])
     np.testing.assert_array_equal(later[-1], one.envs[-1])
 
 
-@pytest.mark.parametrize("name", ["sfkd", "no_transport"])
+@pytest.mark.parametrize("name", ["sfkd", "no_transport", "joint", "path", "state"])
 def test_a_defect_matches_its_definition_on_every_switch(one, name):
     """d_k = Φ(x_{k+1}, e_{k+1}) − T(e_k → e_{k+1}) F(Φ(x_k, e_k), u_k, e_k), step by
     step.
@@ -49,13 +48,16 @@ def test_a_defect_matches_its_definition_on_every_switch(one, name):
         )
         return model.encode(fiber_next, after).z - expected.z
 
-    gaps, _ = run(defects, name, one)
+    free, single, gaps, _ = run(predictions, name, one)
     for k in (0, 4, len(one.envs) - 2):
         gap = by_hand(
             params, *one.envs[k : k + 2], *one.states[k : k + 2], one.controls[k]
         )
         np.testing.assert_allclose(gaps[k], gap, atol=3e-6)
     assert float(jnp.max(jnp.abs(gaps))) > 1e-4
+    # Beside them the same free predictions as planners and figures have.
+    np.testing.assert_allclose(free, run(rollout, name, one), atol=1e-5)
+    np.testing.assert_allclose(free[0], single[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [1, 3, 7, 50])

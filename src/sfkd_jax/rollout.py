@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -117,6 +118,7 @@ def with_offset(model: Model) -> Model:
         observe=inner(model.observe),
         # Folding is for the parameters inside, see `Offset.params`.
         shared=None,
+        fitting=model.fitting._replace(step_fiber=None),
         on_road=on_road
         and (lambda at, road: at._replace(params=on_road(at.params, road))),
         structure=Structure(inner(structure.explicit), inner(structure.rate)),
@@ -136,29 +138,74 @@ def fibers_along(
     model: Model, params: Params, trajectory: Trajectory
 ) -> tuple[Fiber, Fiber]:
     """Return the fibers of e_0 … e_{T-1} and of e_1 … e_{T-1}, e_{T-1}."""
-    fibers = jax.vmap(model.fiber, in_axes=(None, 0))(params, trajectory.envs)
+    own = model.fitting.step_fiber or (lambda params, env, _: model.fiber(params, env))
+    # At once for all steps, where it is one product, and not in a loop over them.
+    fibers = jax.vmap(partial(own, params))(trajectory.envs, trajectory.controls)
     # After the last step no further e is known: it is taken to stay.
     later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
     return fibers, later
 
 
+class Predictions(NamedTuple):
+    """Of x_1 … x_T of one trajectory."""
+
+    free: Float[Array, "time state"]  # from x_0
+    single: Float[Array, "time state"]  # each from the true state before
+    defects: Float[Array, "time rank"]
+    fibers: Fiber  # of e_0 … e_{T-1}
+
+
 def rollout(
     model: Model, params: Params, trajectory: Trajectory
-) -> tuple[Float[Array, "time state"], Latent, tuple[Fiber, Fiber]]:
-    """Predict x_1 … x_T from x_0, u and e; return the latents and fibers as well."""
+) -> Float[Array, "time state"]:
+    """Predict x_1 … x_T from x_0, u and e."""
+    return _free(model, trajectory, *fibers_along(model, params, trajectory))
+
+
+def predictions(model: Model, params: Params, trajectory: Trajectory) -> Predictions:
+    """Predict freely and step by step; return the disturbances d_k of the steps too.
+
+        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
+
+    F is the latent step.
+    """
     fibers, later = fibers_along(model, params, trajectory)
+    # One frame for all times, or latents in a frame could not be compared.
+    origin = model.encode(_at(fibers, 0), trajectory.states[0])
+    observe = jax.vmap(model.observe, in_axes=(0, None, 0))
+    now = observe(fibers, origin, trajectory.states[:-1])
+    step = jax.vmap(partial(_step, model))
+    expected = step(now, (fibers, later, trajectory.controls))
+    # Under the next environment, to which `expected` was transported.
+    after = observe(later, origin, trajectory.states[1:])
+    return Predictions(
+        free=_free(model, trajectory, fibers, later),
+        single=jax.vmap(model.decode)(later, expected),
+        defects=jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected),
+        fibers=fibers,
+    )
+
+
+def _free(
+    model: Model, trajectory: Trajectory, fibers: Fiber, later: Fiber
+) -> Float[Array, "time state"]:
+    """`rollout` with its fibers."""
     # In the first environment, in which the first step is taken.
     start = model.encode(_at(fibers, 0), trajectory.states[0])
 
     def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
-        fiber, fiber_next, control = inputs
-        # First the step under e, then transport to e': z belongs to the next fiber.
-        latent = model.transport(fiber, fiber_next, model.step(fiber, latent, control))
+        latent = _step(model, latent, inputs)
         return latent, latent
 
     _, latents = jax.lax.scan(step, start, (fibers, later, trajectory.controls))
     # In the later fibers, to which transport has carried the latents.
-    return jax.vmap(model.decode)(later, latents), latents, (fibers, later)
+    return jax.vmap(model.decode)(later, latents)
+
+
+def _step(model: Model, latent: Latent, inputs: tuple[Fiber, Fiber, Control]) -> Latent:
+    """Step under e, then transport to e': the result belongs to the next fiber."""
+    fiber, later, control = inputs
+    return model.transport(fiber, later, model.step(fiber, latent, control))
 
 
 def windows(
@@ -227,31 +274,6 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
         return leaf.swapaxes(0, 1).reshape(-1, *leaf.shape[2:])[:count]
 
     return jax.tree.map(joined, results)
-
-
-def defects(
-    model: Model,
-    params: Params,
-    trajectory: Trajectory,
-    along: tuple[Fiber, Fiber] | None = None,
-) -> tuple[Float[Array, "time rank"], Float[Array, "time state"]]:
-    """Return the one-step disturbances d_k and the one-step predictions of the states.
-
-        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
-
-    F is the latent step.
-    """
-    fibers, later = along or fibers_along(model, params, trajectory)
-    # One frame for all times, or latents in a frame could not be compared.
-    origin = model.encode(_at(fibers, 0), trajectory.states[0])
-    observe = jax.vmap(model.observe, in_axes=(0, None, 0))
-    now = observe(fibers, origin, trajectory.states[:-1])
-    expected = jax.vmap(model.step)(fibers, now, trajectory.controls)
-    expected = jax.vmap(model.transport)(fibers, later, expected)
-    # Under the next environment, to which `expected` was transported.
-    after = observe(later, origin, trajectory.states[1:])
-    gap = jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected)
-    return gap, jax.vmap(model.decode)(later, expected)
 
 
 def _at(tree: Any, index: int) -> Any:

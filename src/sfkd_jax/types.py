@@ -160,10 +160,13 @@ class Fitting(NamedTuple):
     Attributes:
         identify: (training, validation data, key) -> params by regression, or None.
         penalty: (fiber, latent, control) -> extra term of the training loss, or None.
+        step_fiber: (params, env, control) -> the fiber of one step, with all that does
+            not depend on the latent; None for `Model.fiber`.
     """
 
     identify: Callable[[Trajectory, Trajectory, Key], Params] | None = None
     penalty: Callable[[Fiber, Latent, Control], Scalar] | None = None
+    step_fiber: Callable[[Params, Environment, Control], Fiber] | None = None
 
 
 class Structure(NamedTuple):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from scipy.special import betaincinv
 
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
-from sfkd_jax.rollout import defects
+from sfkd_jax.rollout import predictions
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 
 KINDS = ("latent", "position", "yaw", "body")
@@ -66,19 +66,20 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
     """`residuals` of one batch of fixed size."""
 
     def one(run: Trajectory) -> tuple[Array, Array]:
-        gaps, predicted = defects(model, params, run)
+        known = predictions(model, params, run)
         before, after = run.states[:-1], run.states[1:]
-        miss = (predicted - after)[:, BODY]
+        miss = (known.single - after)[:, BODY]
         if model.along_path:
             # Path states have their outputs in the body, without a pose.
             kinds = miss[:, LATERAL, None], miss[:, HEADING, None], miss[:, PATH_SPEED:]
         else:
             # As motions of one step: each turns far less than π, so no wrap spoils it.
             moved = jax.vmap(between)
-            motion = moved(before[:, POSE], predicted[:, POSE])
+            motion = moved(before[:, POSE], known.single[:, POSE])
             motion -= moved(before[:, POSE], after[:, POSE])
             kinds = motion[:, :2], motion[:, 2:], miss
-        return gaps, jnp.stack([jnp.linalg.norm(kind, axis=1) for kind in kinds], 1)
+        sizes = jnp.stack([jnp.linalg.norm(kind, axis=1) for kind in kinds], 1)
+        return known.defects, sizes
 
     return jax.vmap(one)(runs)
 

@@ -104,8 +104,7 @@ class Free(nn.Module):
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
         """Return plain weights; the bound is ignored."""
-        # The same signature as `Sandwich`, so that
-        # the ablation exchanges the class alone.
+        # The signature of `Sandwich`: the ablation exchanges the class alone.
         sizes = pairwise((self.inputs, *self.hidden, self.outputs))
         spread = nn.initializers.lecun_normal()
         matrices = tuple(
@@ -133,8 +132,7 @@ class Encoder(nn.Module):
         """Return z before rotation, shape (rank,)."""
         # e enters through its embedding, so that the lift may differ by environment.
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
-        # Not one layer on [s; hidden]: the ablation
-        # drops W_0 s and leaves the rest as it is.
+        # Not one layer on [s; hidden]: the ablation drops W_0 s and nothing else.
         z = nn.Dense(self.rank)(hidden)
         return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
 

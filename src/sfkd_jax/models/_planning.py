@@ -178,7 +178,6 @@ class Planning:
         planning = state_model(self.init, self.fiber, self.step, state_size=size)
         planning = planning._replace(shared=F.shared, along_path=F.along_path)
         if F.along_path:
-            # There is no pose: that of the start stays.
             planning = planning._replace(
                 encode=lambda fiber, state: jnp.append(state[BODY], 1.0),
                 decode=lambda fiber, latent: path_state(latent[:-1]),

@@ -233,7 +233,8 @@ def _optimizer(
     )
     # Before Adam: one exploding batch would spoil its moments for long.
     clip = optax.clip_by_global_norm(clip_norm)
-    return optax.chain(clip, optax.adam(schedule)), schedule
+    # As one vector: a few operations, where each of many arrays would have its own.
+    return optax.flatten(optax.chain(clip, optax.adam(schedule))), schedule
 
 
 def _chunk(
@@ -255,6 +256,8 @@ def _chunk(
         def step(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
             # From the step, not a carried key: a resumed run draws the same batches.
             batch = draw(data, jax.random.fold_in(key, state.step))
+            # Or every use of it would gather it again.
+            batch = jax.lax.optimization_barrier(batch)
             (total, parts), grads = gradient(state.params, batch)
             updates, memory = transform.update(grads, state.optimizer, state.params)
             after = TrainState(

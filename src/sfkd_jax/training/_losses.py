@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
-from sfkd_jax.rollout import Folded, defects, fold, rollout, state_errors
+from sfkd_jax.rollout import Folded, fold, predictions, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
 
 Parts: TypeAlias = dict[str, Scalar]
@@ -130,6 +130,8 @@ def multi_step_loss(
     def evaluate(params: Params, batch: Trajectory) -> Evaluated:
         # The e of another window: transport is trained between unlike environments.
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
+        # Its bounds are enforced once for all that reads the weights.
+        params = fold(model, params)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
         scores, gaps = parts.pop("score"), parts.pop("gap")
         parts = {name: jnp.mean(part) for name, part in parts.items()}
@@ -158,7 +160,7 @@ def one_step_loss(model: Model) -> Loss:
     """
 
     def error(params: Params, data: Trajectory) -> Scalar:
-        after = rollout(model, params, data)[0]
+        after = rollout(model, params, data)
         # In the frame of the car, as the scale is.
         gap = state_errors(after, data.states[1:])
         return jnp.mean((gap / jax.lax.stop_gradient(params["scale"])) ** 2)
@@ -178,7 +180,7 @@ def planning_loss(model: Model, params: Params, space: Space) -> Loss:
 
     def error(weights: Params, data: Trajectory) -> Scalar:
         own = Folded({**params, "planning": weights}, frozen.shared)
-        after = rollout(planning, own, data)[0]
+        after = rollout(planning, own, data)
         return jnp.mean((state_errors(after, data.states[1:]) * units) ** 2)
 
     return _mean_of(error)
@@ -204,9 +206,8 @@ def _window_parts(
     other: Environment,
 ) -> dict[str, Array]:
     """The parts of the loss of one window; `other` is another window's environment."""
-    # One rollout for both errors: `along` are the fibers that `defects` needs.
-    predicted, _, along = rollout(model, params, data)
-    errors = state_errors(predicted, data.states[1:])
+    known = predictions(model, params, data)
+    errors = state_errors(known.free, data.states[1:])
 
     def prediction(growth: float) -> Scalar:
         # Errors grow about linearly; without this the far steps would decide alone.
@@ -214,11 +215,10 @@ def _window_parts(
         weighted = (errors * units / 0.01 / steps[:, None]) ** 2
         return jnp.mean(jnp.sum(weighted, axis=1))
 
-    gap, single = defects(model, params, data, along)
     # In millimetres: a slip of one a step hides in the sums over a window.
-    near = state_errors(single, data.states[1:]) * units / 0.001
+    near = state_errors(known.single, data.states[1:]) * units / 0.001
     # That of the first step: the regularisers below are about the first state.
-    fiber = jax.tree.map(lambda leaf: leaf[0], along[0])
+    fiber = jax.tree.map(lambda leaf: leaf[0], known.fibers)
     there = model.fiber(params, other)
     here = model.encode(fiber, data.states[0])
     moved = model.vector(model.transport(fiber, there, here)) - model.vector(
@@ -228,7 +228,7 @@ def _window_parts(
     parts = {
         "prediction": prediction(growth),
         "one_step": jnp.mean(jnp.sum(near**2, axis=1)),
-        "consistency": jnp.mean(jnp.sum(gap**2, axis=1)) / 1e-4,
+        "consistency": jnp.mean(jnp.sum(known.defects**2, axis=1)) / 1e-4,
         "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
         "transport": jnp.sum(moved**2) / 1e-4,
     }
@@ -237,5 +237,5 @@ def _window_parts(
     # Of free-running and of single steps, and what the model itself adds.
     score = prediction(GROWTH) + parts["one_step"] + parts.get("penalty", 0.0)
     # Away from 0, where the root has no gradient.
-    size = jnp.sqrt(jnp.sum(gap**2, axis=1) + 1e-16)
+    size = jnp.sqrt(jnp.sum(known.defects**2, axis=1) + 1e-16)
     return parts | {"score": score, "gap": size}

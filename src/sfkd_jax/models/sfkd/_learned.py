@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -33,6 +34,13 @@ class SharedWeights(NamedTuple):
     readout: Float[Array, "body rank"]
     centre: Float[Array, " body"]
     lift: Float[Array, "rank body"] | None
+
+    @property
+    def ends(self) -> tuple[list[int], list[int]]:
+        """Where the layers end in both tables of `PerEnvironment`."""
+        decoder, rank = self.decoder.matrices, self.readout.shape[1]
+        hidden = (*self.residual.matrices[:-1], *decoder[:-1])
+        return list(accumulate(map(len, hidden))), [rank, rank + 3 * bool(decoder)]
 
 
 class PerEnvironment(NamedTuple):
@@ -243,7 +251,6 @@ def _couplings(key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _near_identity(key: Array, shape: tuple[int, ...]) -> Array:
-    """Initial operators: I plus a little noise, which is slow dynamics."""
-    # Slow dynamics: in a sampling period of 0.1 s a car changes little.
+    """Initial operators: I plus noise, since a car changes little in 0.1 s."""
     noise = jax.random.normal(key, shape, jnp.float32) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=jnp.float32) + noise

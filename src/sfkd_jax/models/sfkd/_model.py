@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -73,19 +72,15 @@ class Mixture(NamedTuple):
 
 
 class SfkdFiber(NamedTuple):
-    """All that depends on e; a network without matrices is absent."""
+    """All that a step needs."""
 
     A: Mixture | Float[Array, "rank rank"]
     local: PerEnvironment
-    residual: tuple[Float[Array, "_ _"], ...]
-    decoder: tuple[Float[Array, "_ _"], ...]
-    forcing: tuple[Float[Array, "_ _"], ...]
-    readout: Float[Array, "body rank"]
-    centre: Float[Array, " body"]
+    shared: SharedWeights
     # Weights of φ, or C⁻¹ where z is the state.
     encoder: Any
-    # Both tables of biases as forms of ψ and u, for training; else None.
-    bilinear: tuple[Float[Array, "_ _"], ...] | None = None
+    # Of one control, see `LatentModel.step_fiber`; else None.
+    terms: tuple[Any, Any, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,39 +127,48 @@ class LatentModel:
         return cast(Scalar, self._apply(params, "rate"))
 
     def fiber(self, params: Params, env: Environment) -> SfkdFiber:
-        """Return all that depends on e; A(e) is summed for folded parameters only.
-
-        Training takes many environments and differentiates by the vertices; see
-        `Mixture`. A controller takes many steps under one environment.
-        """
-        shared = self.shared(params)
-        scaled = self.space.scaled_env(env, self.environment)
-        local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
+        """Return all that depends on e, for many steps in it."""
+        fiber = self._fiber(params, env)
+        local, A = fiber.local, cast(Mixture, fiber.A)
         # For controls as they are: a rollout then scales none of its own.
         gains = tuple(gain / self.space.control_scale for gain in local.gains)
         offsets = _moved(gains, local.offsets, -self.space.control_mean)
         local = local._replace(gains=gains, offsets=offsets)
-        operator = Mixture(local.mixture, shared.vertices)
-        folded = isinstance(params, Folded)
-        if local.mixture is not None and folded:
-            operator = operator.summed()
+        return fiber._replace(A=A if A.weights is None else A.summed(), local=local)
+
+    def step_fiber(
+        self, params: Params, env: Environment, control: Control
+    ) -> SfkdFiber:
+        """Return the fiber of one step, for training: its e and u are its own.
+
+        What depends on both is a product of weights and ψ(e) ⊗ u, without a gain.
+        """
+        fiber = self._fiber(params, env)
+        scaled = jnp.append(self.space.scaled_control(control), 1.0)
+        read = jnp.outer(jnp.append(fiber.local.embedding, 1.0), scaled).ravel()
+        # Weights are split, since gradients of split products would be joined.
+        tables = map(jnp.split, self._apply(params, "bilinear"), fiber.shared.ends)
+        terms = self._joined(fiber, *([part @ read for part in at] for at in tables))
+        local = fiber.local._replace(gains=(), offsets=())
+        return fiber._replace(local=local, terms=terms)
+
+    def _fiber(self, params: Params, env: Environment) -> SfkdFiber:
+        """What fibers are made from, for scaled controls."""
+        shared = self.shared(params)
+        scaled = self.space.scaled_env(env, self.environment)
+        local = cast(PerEnvironment, self._apply(params, "per_environment", scaled))
+        encoder = unfold(params)["encoder"] if self.encoder else shared.lift
         return SfkdFiber(
-            A=operator,
-            local=local,
-            residual=shared.residual.matrices,
-            decoder=shared.decoder.matrices,
-            forcing=shared.forcing,
-            readout=shared.readout,
-            centre=shared.centre,
-            encoder=unfold(params)["encoder"] if self.encoder else shared.lift,
-            bilinear=None if folded else self._apply(params, "bilinear"),
+            Mixture(local.mixture, shared.vertices), local, shared, encoder
         )
 
     def encode(self, fiber: SfkdFiber, state: State) -> PosedLatent:
         """Return the latent of a state, beside its pose."""
         body = self.space.scaled_body(state)
         if self.encoder is None:
-            return PosedLatent(state[POSE], fiber.encoder @ (body - fiber.centre))
+            return PosedLatent(
+                state[POSE], fiber.encoder @ (body - fiber.shared.centre)
+            )
         z = self.encoder.apply({"params": fiber.encoder}, body, fiber.local.embedding)
         z = cast(jax.Array, z)
         # Rotated after the lift, so that z of two environments differ by an isometry.
@@ -177,12 +181,13 @@ class LatentModel:
     ) -> PosedLatent:
         """Advance z and the pose by one sampling period."""
         A, residual, decoder = self._terms(fiber, control)
-        z = A @ latent.z + apply(fiber.residual, residual, latent.z)
+        shared = fiber.shared
+        z = A @ latent.z + apply(shared.residual.matrices, residual, latent.z)
         # Along a path there is no pose: that of the start stays.
-        if not fiber.decoder:
+        if not shared.decoder.matrices:
             return PosedLatent(latent.pose, z)
         # From z before the step: the motion during the period starts there.
-        space, motion = self.space, apply(fiber.decoder, decoder, latent.z)
+        space, motion = self.space, apply(shared.decoder.matrices, decoder, latent.z)
         # Mean plus scale: an output of 0 is the average motion of the data.
         motion = space.increment_mean + space.increment_scale * motion
         return PosedLatent(compose(latent.pose, motion), z)
@@ -192,22 +197,21 @@ class LatentModel:
 
         The residual's last bias includes B(e) u + f(u, e). No bound in z sees a bias.
         """
-        if fiber.bilinear is None:
-            hidden, outer = _moved(fiber.local.gains, fiber.local.offsets, control)
-        else:
-            scaled = jnp.append(self.space.scaled_control(control), 1.0)
-            read = jnp.outer(jnp.append(fiber.local.embedding, 1.0), scaled).ravel()
-            hidden, outer = (table @ read for table in fiber.bilinear)
-        layers = *fiber.residual[:-1], *fiber.decoder[:-1]
-        edges = accumulate(layer.shape[0] for layer in layers)
-        *biases, forcing = jnp.split(hidden, list(edges))
-        rank, inner = fiber.readout.shape[1], max(len(fiber.residual) - 1, 0)
-        pose = 3 if fiber.decoder else 0
-        direct, motion, logits = jnp.split(outer, [rank, rank + pose])
-        A = fiber.A
+        if fiber.terms is not None:
+            return fiber.terms
+        known = _moved(fiber.local.gains, fiber.local.offsets, control)
+        return self._joined(fiber, *map(jnp.split, known, fiber.shared.ends))
+
+    def _joined(
+        self, fiber: SfkdFiber, hidden: Sequence[Array], outer: Sequence[Array]
+    ) -> tuple[Any, Any, Any]:
+        """`_terms` from the biases of every layer."""
+        *biases, forcing = hidden
+        direct, motion, logits = outer
+        inner, A = max(len(fiber.shared.residual.matrices) - 1, 0), fiber.A
         # Decided by the shape of the weights, that is, when the program is traced.
-        if fiber.forcing:
-            direct += fiber.forcing[0] @ jnp.tanh(forcing)
+        if fiber.shared.forcing:
+            direct += fiber.shared.forcing[0] @ jnp.tanh(forcing)
         if isinstance(A, Mixture) and A.weights is None:
             # On the simplex whatever u is, and no function of z: it contracts as ever.
             A = A._replace(weights=jax.nn.softmax(logits))
@@ -215,7 +219,7 @@ class LatentModel:
 
     def decode(self, fiber: SfkdFiber, latent: PosedLatent) -> State:
         """Return the state of a latent."""
-        scaled = fiber.readout @ latent.z + fiber.centre
+        scaled = fiber.shared.readout @ latent.z + fiber.shared.centre
         body = self.space.body_mean + self.space.body_scale * scaled
         return jnp.concatenate([latent.pose, body])
 
@@ -252,7 +256,8 @@ class LatentModel:
     def hinge(self, fiber: SfkdFiber, latent: PosedLatent, control: Control) -> Scalar:
         """Return the weighted penalty max(0, ||∂r/∂z||_2 − β)² (eq:contr_loss)."""
         _, at, _ = self._terms(fiber, control)
-        jacobian = jax.jacobian(lambda z: apply(fiber.residual, at, z))(latent.z)
+        matrices = fiber.shared.residual.matrices
+        jacobian = jax.jacobian(lambda z: apply(matrices, at, z))(latent.z)
         # As the paper has it: a penalty at sampled points, which proves nothing.
         excess = jnp.linalg.norm(jacobian, 2) - self.beta
         return self.soft_penalty * jnp.maximum(0.0, excess) ** 2
@@ -270,7 +275,10 @@ class LatentModel:
             observe=lambda fiber, latent, state: self.encode(fiber, state),
             vector=lambda latent: latent.z,
             shared=self.shared,
-            fitting=Fitting(penalty=self.hinge if self.soft_penalty else None),
+            fitting=Fitting(
+                penalty=self.hinge if self.soft_penalty else None,
+                step_fiber=self.step_fiber,
+            ),
             # A free residual may contract, but only a certificate can tell.
             structure=Structure(
                 self.explicit, self.rate if self.learned.bounded else None

@@ -19,8 +19,6 @@ LARGEST_COUPLING = 0.999
 float32.
 """
 BUDGETS = ("joint", "sum")
-
-
 RESIDUALS = {"sandwich": Sandwich, "free": Free, "none": None}
 """(inputs, hidden widths, outputs) -> flax module, by name; None: no residual. A step
 with a `Free` one does not contract by construction.
@@ -55,7 +53,6 @@ def share_budget(
     `operators` M_j and `couplings` (G, H) are bounded here, `network` φ is. Returns A_j
     and the residual with G and α H folded into its last and first weights.
     """
-    # Kept apart from 1, or the factors below would be singular.
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
     # Cholesky factors instead of square roots: any L with L L' = I − G G' serves.
     identity = jnp.eye(out.shape[0])
