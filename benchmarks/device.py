@@ -3,8 +3,9 @@
 python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]: time and
 memory of a jitted control step by the number of samples, and of several also by horizon
 and vehicles; and one-minute S3 episodes simulated at once, with the share that stays in
-the certified corridor. With XLA_FLAGS=--xla_force_host_platform_device_count=2 it
-spreads the samples over two devices.
+the certified corridor. With --planners 16 it drives so many roads with each planner in
+place of that. With XLA_FLAGS=--xla_force_host_platform_device_count=2 it spreads the
+samples over two devices.
 """
 
 import json
@@ -28,12 +29,36 @@ HORIZON, SETTLED, PERIOD = 20, 20, 0.1
 """Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
 
 
-def loaded(name, samples, *, horizon=HORIZON, **changes):
-    """The shipped policy along a path with another number of samples, and settings."""
+PLANNERS = {
+    "the law alone": {"num_samples": 1},
+    **{f"MPPI, {n} samples": {"num_samples": n} for n in (16, 64, 300, 1500)},
+    **{
+        f"{n}, without shrinkage": {"num_samples": n, "shrinkage": False}
+        for n in (16, 300, 1500)
+    },
+    **{
+        f"CEM, 3 x {n}": {"planner": "cem", "num_samples": n, "elites": n // 10}
+        for n in (100, 500)
+    },
+    **{f"gradient, {n}": {"planner": "gradient", "iterations": n} for n in (1, 5)},
+}
+"""What differs from the shipped planner."""
+ROADS = {"dynamic": "s3", "kinematic": "s2"}
+"""Scenarios on which planners are compared."""
+
+
+def loaded(name, num_samples=1500, *, planner="mppi", **own):
+    """The shipped policy along a path with another planner, or settings of it."""
     directory = SHIPPED / f"{name}_path"
-    settings = sfkd_jax.load(directory).settings["controller"]
-    mppi = settings["mppi"] | {"num_samples": samples, "horizon": horizon}
-    return sfkd_jax.load(directory, controller=settings | {"mppi": mppi} | changes)
+    settings = dict(sfkd_jax.load(directory).settings["controller"])
+    mppi = settings.pop("mppi")
+    if planner == "mppi":
+        own = mppi | {"num_samples": num_samples} | own
+    elif planner == "cem":
+        own["num_samples"] = num_samples
+    own = {"noise_std": mppi["noise_std"], "horizon": mppi["horizon"]} | own
+    settings |= {"planner": planner, planner: own}
+    return sfkd_jax.load(directory, controller=settings)
 
 
 def family(plant, name, duration, **options):
@@ -66,13 +91,13 @@ def rmse_mm(lateral):
     return 1e3 * np.sqrt(np.mean(lateral**2, axis=1))
 
 
-def control_step(name, steps, *, samples, vehicles=1, at_once=1, horizon=HORIZON):
+def control_step(policy, steps, *, vehicles=1, at_once=1):
     """Time of one control step of one of several vehicles, in batches of `at_once`.
 
     What a single vehicle observes comes from the host, and its control goes back; its
     samples are spread over all devices.
     """
-    policy = loaded(name, samples, horizon=horizon)
+    horizon = policy.interface["horizon"]
     episode = jax.jit(family(policy.vehicle, "s3", 15.0))(jax.random.key(0))
     seen = (
         episode.initial_state,
@@ -108,7 +133,6 @@ def control_step(name, steps, *, samples, vehicles=1, at_once=1, horizon=HORIZON
             np.asarray(control)
             times.append(1e3 * (time.perf_counter() - start) / vehicles)
     return {
-        "samples": samples,
         "vehicles": vehicles,
         "at_once": at_once,
         "horizon": horizon,
@@ -154,28 +178,59 @@ def episodes(name, samples, count, seed):
     }
 
 
+def compared(name, count, seed):
+    """Time of a control step and error of every planner, on the same roads."""
+    keys = jax.random.split(jax.random.key(seed), count)
+    for label, own in PLANNERS.items():
+        policy = loaded(name, **own)
+        took = control_step(policy, 200)["median_ms"]
+        lateral = fresh_episodes(policy, ROADS[name], 30.0)(keys)[:, SETTLED:]
+        row = {
+            "planner": label,
+            "median_ms": took,
+            "rmse_mm": rmse_mm(lateral).tolist(),
+        }
+        print(row, flush=True)
+        yield row
+
+
 def main():
     """Measure, print and store."""
     asked = arguments(
-        __doc__, __file__, cars=CARS, samples=[1500], steps=200, episodes=16, seed=2026
+        __doc__,
+        __file__,
+        cars=CARS,
+        samples=[1500],
+        steps=200,
+        episodes=16,
+        planners=0,
+        seed=2026,
     )
     device = jax.devices()[0].device_kind
     if jax.device_count() > 1:
         device = f"{jax.device_count()} x {device}"
     for name in asked.cars:
-        steps = [
-            control_step(name, max(asked.steps // one.get("vehicles", 1), 10), **one)
-            for one in scales(asked.samples)
-        ]
-        found = {"control_step": steps}
-        if asked.episodes:
-            found["s3"] = episodes(name, asked.samples[0], asked.episodes, asked.seed)
+
+        def step(samples=FEW, horizon=HORIZON, vehicles=1, name=name, **one):
+            policy = loaded(name, samples, horizon=horizon)
+            steps = max(asked.steps // vehicles, 10)
+            about = {"samples": samples, "horizon": horizon}
+            return about | control_step(policy, steps, vehicles=vehicles, **one)
+
+        if asked.planners:
+            found = {"planners": list(compared(name, asked.planners, asked.seed))}
+        else:
+            found = {"control_step": [step(**one) for one in scales(asked.samples)]}
+            if asked.episodes:
+                about = asked.samples[0], asked.episodes, asked.seed
+                found["s3"] = episodes(name, *about)
         print(name, json.dumps(found), flush=True)
         # One file for all devices and cars: what was measured before stays.
         known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
         about = known.setdefault("devices", {}).setdefault(device, {})
         about["jax"] = jax.__version__
-        about.setdefault("policies", {})[f"{name}_path"] = found
+        policies = about.setdefault("policies", {})
+        policies.setdefault(f"{name}_path", {}).update(found)
         asked.out.write_text(json.dumps(known, indent=1) + "\n")
 
 

@@ -116,7 +116,7 @@ def test_cem_keeps_constraints_too():
 
 def test_a_search_that_does_not_rank_is_refused():
     task = control.constrained(POINT, lambda data, x, u, target, at: x)
-    with pytest.raises(ValueError, match="constraints need a search"):
+    with pytest.raises(ValueError, match="constraints need mppi"):
         control.gradient_planner(task, horizon=4, noise_std=(1.0, 1.0))
 
 

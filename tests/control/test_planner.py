@@ -54,9 +54,7 @@ def act(planner, state=None, x=START, env=NOTHING, reference=(), params=None):
 
 
 def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
-    """Plan repeatedly from the same state: the plan to which the search converges, and
-    controls and infos of all steps.
-    """
+    """Plan repeatedly from the same state; return controls and infos of all steps."""
     planner = SEARCHES[search](task or double_integrator(), **settings)
 
     @jit
@@ -74,9 +72,7 @@ def plan_for(search, task=None, steps=12, start=START, env=NOTHING, **settings):
 
 
 def optimal():
-    """Optimal cost and controls of the linear-quadratic problem, by a Riccati recursion
-    in float64.
-    """
+    """Optimal cost and controls, by a Riccati recursion in float64."""
     a, b, q = A.astype(float), B.astype(float), np.diag(Q).astype(float)
     value, gains = np.zeros((2, 2)), []
     for _ in range(HORIZON):
@@ -111,6 +107,10 @@ def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
     costs = np.asarray(info["mean_cost"])
     assert np.all(costs[1:] <= costs[:-1] * (1 + 1e-6))
     np.testing.assert_allclose(state.plan, optimal()[1], atol=0.05)
+    # A plan of before that is worse than none does not hold it up.
+    worse = tuned(state._replace(plan=-9.0 * state.plan), elapsed=0.0)
+    _, _, info = act(SEARCHES["gradient"](double_integrator()), worse)
+    assert info["mean_cost"] <= HORIZON * Q[0] * START[0] ** 2
 
 
 @every

@@ -29,8 +29,8 @@ class GradientPlanner(Planner):
 
     Perturbations are measured in units of noise_std (Σ = diag(σ²)), so a step of 1
     moves a control by about σ. All candidates of a line search are rolled out as one
-    batch; s = 0 is one of them, so the cost never increases. The perturbations that
-    the limits allowed are kept, which projects the plan onto the limits.
+    batch, with s = 0 and ν = 0: the cost never increases, nor is above that of the law.
+    The perturbations that the limits allowed are kept: projected onto the limits.
 
     Nothing is random, and the key is not used. Derivatives that are not finite count
     as zero. The task must be differentiable.
@@ -48,9 +48,7 @@ class GradientPlanner(Planner):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.task.constraint is not None:
-            raise ValueError(
-                "constraints need a search that ranks by them: mppi or cem"
-            )
+            raise ValueError("constraints need mppi or cem, which rank by them")
 
     def search(
         self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
@@ -68,7 +66,9 @@ class GradientPlanner(Planner):
             size = jnp.sqrt(jnp.mean(downhill**2))
             # Of unit size, so that a step length means the same for every cost.
             direction = downhill / jnp.where(size > 0, size, 1.0) * std[None]
-            tried = evaluate(plan[:, None] + sizes[None, :, None] * direction[:, None])
+            ahead = plan[:, None] + sizes[None, :, None] * direction[:, None]
+            # After a switch of e the plan of before may be worse than none.
+            tried = evaluate(jnp.append(ahead, jnp.zeros_like(ahead[:, :1]), axis=1))
             costs, _ = tried.ranked()
             best = jnp.argmin(costs)
             plan = replace_nonfinite(tried.perturbations[:, best], 0.0)
