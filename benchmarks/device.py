@@ -25,39 +25,30 @@ SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
 NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
 FEW, AUTO = 300, (jax.sharding.AxisType.Auto,)
+DEFAULTS = dict(samples=[1500], steps=200, episodes=16, planners=0, seed=2026)
 HORIZON, SETTLED, PERIOD = 20, 20, 0.1
 """Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
-
-
-PLANNERS = {
-    "the law alone": {"num_samples": 1},
-    **{f"MPPI, {n} samples": {"num_samples": n} for n in (16, 64, 300, 1500)},
-    **{
-        f"{n}, without shrinkage": {"num_samples": n, "shrinkage": False}
-        for n in (16, 300, 1500)
-    },
-    **{
-        f"CEM, 3 x {n}": {"planner": "cem", "num_samples": n, "elites": n // 10}
-        for n in (100, 500)
-    },
-    **{f"gradient, {n}": {"planner": "gradient", "iterations": n} for n in (1, 5)},
-}
+PLANNERS = {"law alone": {"num_samples": 1}}
+for n in (16, 300, 1500):
+    PLANNERS[f"MPPI, {n}"] = {"num_samples": n}
+for n in (16, 1500):
+    PLANNERS[f"{n}, no shrinkage"] = {"num_samples": n, "shrinkage": False}
+PLANNERS["CEM, 3×500"] = {"planner": "cem", "num_samples": 500, "elites": 50}
+for n in (1, 5):
+    PLANNERS[f"gradient, {n}"] = {"planner": "gradient", "iterations": n}
 """What differs from the shipped planner."""
 ROADS = {"dynamic": "s3", "kinematic": "s2"}
 """Scenarios on which planners are compared."""
 
 
-def loaded(name, num_samples=1500, *, planner="mppi", **own):
+def loaded(name, samples=1500, *, planner="mppi", **own):
     """The shipped policy along a path with another planner, or settings of it."""
     directory = SHIPPED / f"{name}_path"
     settings = dict(sfkd_jax.load(directory).settings["controller"])
-    mppi = settings.pop("mppi")
-    if planner == "mppi":
-        own = mppi | {"num_samples": num_samples} | own
-    elif planner == "cem":
-        own["num_samples"] = num_samples
-    own = {"noise_std": mppi["noise_std"], "horizon": mppi["horizon"]} | own
-    settings |= {"planner": planner, planner: own}
+    shipped = settings.pop("mppi") | {"num_samples": samples}
+    if planner != "mppi":
+        shipped = {key: shipped[key] for key in ("noise_std", "horizon")}
+    settings |= {"planner": planner, planner: shipped | own}
     return sfkd_jax.load(directory, controller=settings)
 
 
@@ -91,26 +82,18 @@ def rmse_mm(lateral):
     return 1e3 * np.sqrt(np.mean(lateral**2, axis=1))
 
 
-def control_step(policy, steps, *, vehicles=1, at_once=1):
+def control_step(name, steps, *, vehicles=1, at_once=1, **own):
     """Time of one control step of one of several vehicles, in batches of `at_once`.
 
     What a single vehicle observes comes from the host, and its control goes back; its
     samples are spread over all devices.
     """
-    horizon = policy.interface["horizon"]
-    episode = jax.jit(family(policy.vehicle, "s3", 15.0))(jax.random.key(0))
-    seen = (
-        episode.initial_state,
-        episode.envs[0],
-        scenarios.reference_window(
-            episode.path,
-            jnp.zeros(()),
-            episode.speed,
-            dt=policy.vehicle.dt,
-            horizon=horizon,
-        ),
-    )
-    keys = jax.random.key(0)
+    policy, keys = loaded(name, **own), jax.random.key(0)
+    horizon, steps = policy.interface["horizon"], max(steps // vehicles, 10)
+    episode = jax.jit(family(policy.vehicle, "s3", 15.0))(keys)
+    window = partial(scenarios.reference_window, dt=PERIOD, horizon=horizon)
+    ahead = window(episode.path, jnp.zeros(()), episode.speed)
+    seen = episode.initial_state, episode.envs[0], ahead
     init, act = policy.controller.init, partial(policy.controller.act, policy.params)
     if vehicles > 1:
         seen = jax.tree.map(lambda leaf: jnp.stack([leaf] * vehicles), seen)
@@ -133,6 +116,7 @@ def control_step(policy, steps, *, vehicles=1, at_once=1):
             np.asarray(control)
             times.append(1e3 * (time.perf_counter() - start) / vehicles)
     return {
+        "samples": own.get("num_samples"),
         "vehicles": vehicles,
         "at_once": at_once,
         "horizon": horizon,
@@ -147,12 +131,12 @@ def control_step(policy, steps, *, vehicles=1, at_once=1):
 def scales(samples):
     """What is measured: samples, horizons, vehicles."""
     for number in samples:
-        yield {"samples": number}
+        yield {"num_samples": number}
     if len(samples) > 1:
         for horizon in (10, 50, 100):
-            yield {"samples": samples[0], "horizon": horizon}
+            yield {"num_samples": samples[0], "horizon": horizon}
         for at_once, vehicles in ((16, 16), (16, 256), (256, 256)):
-            yield {"samples": FEW, "vehicles": vehicles, "at_once": at_once}
+            yield {"num_samples": FEW, "vehicles": vehicles, "at_once": at_once}
 
 
 def episodes(name, samples, count, seed):
@@ -180,47 +164,32 @@ def episodes(name, samples, count, seed):
 
 def compared(name, count, seed):
     """Time of a control step and error of every planner, on the same roads."""
-    keys = jax.random.split(jax.random.key(seed), count)
+    keys, law = jax.random.split(jax.random.key(seed), count), None
     for label, own in PLANNERS.items():
-        policy = loaded(name, **own)
-        took = control_step(policy, 200)["median_ms"]
-        lateral = fresh_episodes(policy, ROADS[name], 30.0)(keys)[:, SETTLED:]
-        row = {
-            "planner": label,
-            "median_ms": took,
-            "rmse_mm": rmse_mm(lateral).tolist(),
-        }
-        print(row, flush=True)
-        yield row
+        took = control_step(name, 200, **own)["median_ms"]
+        drive = fresh_episodes(loaded(name, **own), ROADS[name], 30.0)
+        errors = rmse_mm(drive(keys)[:, SETTLED:])
+        law = errors if law is None else law
+        ratio, spread = np.mean(errors / law), np.std(errors / law) / np.sqrt(count)
+        row = {"planner": label, "median_ms": took, "rmse_mm": float(np.mean(errors))}
+        yield row | {"over_law": float(ratio), "standard_error": float(spread)}
 
 
 def main():
     """Measure, print and store."""
-    asked = arguments(
-        __doc__,
-        __file__,
-        cars=CARS,
-        samples=[1500],
-        steps=200,
-        episodes=16,
-        planners=0,
-        seed=2026,
-    )
+    asked = arguments(__doc__, __file__, cars=CARS, **DEFAULTS)
     device = jax.devices()[0].device_kind
     if jax.device_count() > 1:
         device = f"{jax.device_count()} x {device}"
     for name in asked.cars:
-
-        def step(samples=FEW, horizon=HORIZON, vehicles=1, name=name, **one):
-            policy = loaded(name, samples, horizon=horizon)
-            steps = max(asked.steps // vehicles, 10)
-            about = {"samples": samples, "horizon": horizon}
-            return about | control_step(policy, steps, vehicles=vehicles, **one)
-
         if asked.planners:
             found = {"planners": list(compared(name, asked.planners, asked.seed))}
         else:
-            found = {"control_step": [step(**one) for one in scales(asked.samples)]}
+            step, sizes = (
+                partial(control_step, name, asked.steps),
+                scales(asked.samples),
+            )
+            found = {"control_step": [step(**one) for one in sizes]}
             if asked.episodes:
                 about = asked.samples[0], asked.episodes, asked.seed
                 found["s3"] = episodes(name, *about)

@@ -38,8 +38,6 @@ KINDS = ("law", "worst", "brake", "linear", "NaN", "lock")
 """Of requests: law + ν; ν outwards; −6 m/s²; the law of the box without recovery; not a
 number; full lock.
 """
-
-
 REAL, WHOLE = np.float32, np.int32
 CALL = {
     "env": ((2,), REAL),  # that the car is in

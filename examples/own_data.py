@@ -110,7 +110,7 @@ def main(
 
 def error_of_position(model, params, window):
     """Distance between the last predicted position and the true one [m]."""
-    predicted = rollout(model, params, window)
+    predicted = rollout(model, params, window).free
     return jnp.linalg.norm(predicted[-1, :2] - window.states[-1, :2])
 
 

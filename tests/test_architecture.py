@@ -79,7 +79,7 @@ HEAVY = {
 FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
 """What is loaded when its adapter is asked for."""
 
-LINES = {"src": 25_894, "tests": 15_507, "benchmarks, experiments": 2_496}
+LINES = {"src": 25_880, "tests": 15_505, "benchmarks, experiments": 2_491}
 """As they are; 20 000 and 15 000 are aimed at."""
 FILES_IN_SRC = 121
 

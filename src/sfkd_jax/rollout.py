@@ -155,57 +155,37 @@ class Predictions(NamedTuple):
     fibers: Fiber  # of e_0 … e_{T-1}
 
 
-def rollout(
-    model: Model, params: Params, trajectory: Trajectory
-) -> Float[Array, "time state"]:
-    """Predict x_1 … x_T from x_0, u and e."""
-    return _free(model, trajectory, *fibers_along(model, params, trajectory))
-
-
-def predictions(model: Model, params: Params, trajectory: Trajectory) -> Predictions:
+def rollout(model: Model, params: Params, trajectory: Trajectory) -> Predictions:
     """Predict freely and step by step; return the disturbances d_k of the steps too.
 
         d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
 
-    F is the latent step.
+    F is the latent step. Compiled, what is not used costs nothing.
     """
     fibers, later = fibers_along(model, params, trajectory)
-    # One frame for all times, or latents in a frame could not be compared.
-    origin = model.encode(_at(fibers, 0), trajectory.states[0])
+    # In the first environment; one frame for all times, or z could not be compared.
+    first = jax.tree.map(lambda leaf: leaf[0], fibers)
+    origin = model.encode(first, trajectory.states[0])
     observe = jax.vmap(model.observe, in_axes=(0, None, 0))
     now = observe(fibers, origin, trajectory.states[:-1])
-    step = jax.vmap(partial(_step, model))
-    expected = step(now, (fibers, later, trajectory.controls))
-    # Under the next environment, to which `expected` was transported.
+
+    def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
+        fiber, fiber_next, control = inputs
+        # First the step under e, then transport to e': z belongs to the next fiber.
+        latent = model.transport(fiber, fiber_next, model.step(fiber, latent, control))
+        return latent, latent
+
+    inputs = fibers, later, trajectory.controls
+    expected, _ = jax.vmap(step)(now, inputs)
+    _, latents = jax.lax.scan(step, origin, inputs)
+    # In the later fibers, to which transport has carried the latents.
     after = observe(later, origin, trajectory.states[1:])
     return Predictions(
-        free=_free(model, trajectory, fibers, later),
+        free=jax.vmap(model.decode)(later, latents),
         single=jax.vmap(model.decode)(later, expected),
         defects=jax.vmap(model.vector)(after) - jax.vmap(model.vector)(expected),
         fibers=fibers,
     )
-
-
-def _free(
-    model: Model, trajectory: Trajectory, fibers: Fiber, later: Fiber
-) -> Float[Array, "time state"]:
-    """`rollout` with its fibers."""
-    # In the first environment, in which the first step is taken.
-    start = model.encode(_at(fibers, 0), trajectory.states[0])
-
-    def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
-        latent = _step(model, latent, inputs)
-        return latent, latent
-
-    _, latents = jax.lax.scan(step, start, (fibers, later, trajectory.controls))
-    # In the later fibers, to which transport has carried the latents.
-    return jax.vmap(model.decode)(later, latents)
-
-
-def _step(model: Model, latent: Latent, inputs: tuple[Fiber, Fiber, Control]) -> Latent:
-    """Step under e, then transport to e': the result belongs to the next fiber."""
-    fiber, later, control = inputs
-    return model.transport(fiber, later, model.step(fiber, latent, control))
 
 
 def windows(
@@ -274,8 +254,3 @@ def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
         return leaf.swapaxes(0, 1).reshape(-1, *leaf.shape[2:])[:count]
 
     return jax.tree.map(joined, results)
-
-
-def _at(tree: Any, index: int) -> Any:
-    """Index the leading axis of every leaf."""
-    return jax.tree.map(lambda leaf: leaf[index], tree)

@@ -193,7 +193,7 @@ def test_every_distance_to_a_nominal_model_lies_within_the_radius_of_its_run():
     form bounds the next.
     """
     model, _, folded = trained()
-    predicted = jax.jit(jax.vmap(lambda run: rollout(model, folded, run)))(runs())
+    predicted = jax.jit(jax.vmap(lambda run: rollout(model, folded, run).free))(runs())
     for index, name in enumerate(OUTPUTS):
         distance = np.abs(np.asarray(predicted - runs().states[:, 1:]))
         distance = distance[..., 3 + index].max(axis=1)

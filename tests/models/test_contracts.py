@@ -92,7 +92,7 @@ def test_gradients_of_a_rollout_are_finite_and_reach_every_parameter_in_use(name
     model, params = model_and_params(name)
 
     def loss(params):
-        predicted = rollout(model, params, one)
+        predicted = rollout(model, params, one).free
         total = jnp.sum((predicted - one.states[1:]) ** 2)
         if model.fitting.penalty is not None:
             fiber = model.fiber(params, one.envs[0])

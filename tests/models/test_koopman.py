@@ -12,7 +12,7 @@ from sfkd_jax import data as datasets
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
 from sfkd_jax.models._koopman import along_circle, ridge_regression
-from sfkd_jax.rollout import predictions
+from sfkd_jax.rollout import rollout
 from sfkd_jax.types import POSE, Trajectory
 
 F = np.float32([[0.9, 0.1], [-0.2, 0.7]])
@@ -153,7 +153,7 @@ def test_driving_is_predicted_far_better_than_by_no_change():
     selection.
     """
     model, params = driving()
-    each = jax.vmap(partial(predictions, model), in_axes=(None, 0))
+    each = jax.vmap(partial(rollout, model), in_axes=(None, 0))
     miss = jit(lambda params, drives: each(params, drives).defects)
     errors, zero = (
         np.sqrt(np.mean(np.square(miss(p, dataset().test)), axis=(0, 1)))

@@ -10,7 +10,7 @@ from helpers import TINY, any_law, jit
 
 from sfkd_jax import models, plants
 from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
-from sfkd_jax.rollout import predictions
+from sfkd_jax.rollout import rollout
 from sfkd_jax.training import multi_step_loss
 from sfkd_jax.training._losses import power_mean
 
@@ -43,7 +43,7 @@ def test_the_tube_in_the_loss_is_the_read_out_times_the_defect_over_what_contrac
     model, space, params, batch = learned
     loss = multi_step_loss(model, space, tube=(0.5,))
     total, parts, _ = loss.validate(params, batch)
-    gaps = jit(jax.vmap(lambda drive: predictions(model, params, drive).defects))(batch)
+    gaps = jit(jax.vmap(lambda drive: rollout(model, params, drive).defects))(batch)
     largest = float(power_mean(jnp.linalg.norm(gaps, axis=-1)))
     row = float(jnp.linalg.norm(model.structure.explicit(params).readout[0]))
     np.testing.assert_allclose(

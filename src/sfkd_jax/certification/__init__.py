@@ -8,9 +8,6 @@ from sfkd_jax.certification._attack import (
 )
 from sfkd_jax.certification._certificate import Certificate as Certificate
 from sfkd_jax.certification._certificate import certify as certify
-from sfkd_jax.certification._certificate import (
-    contraction_metrics as contraction_metrics,
-)
 from sfkd_jax.certification._certificate import issue as issue
 from sfkd_jax.certification._certificate import verify as verify
 from sfkd_jax.certification._claims import OutputMetric as OutputMetric

@@ -98,7 +98,7 @@ def simulate_nominal(
     model, spread = loop.model, spread_of(loop.noise, runs.states.shape[-1])
 
     def lateral(run: Trajectory) -> Array:
-        return rollout(model, loop.params, run)[:, BODY][:, LATERAL]
+        return rollout(model, loop.params, run).free[:, BODY][:, LATERAL]
 
     def gap(state: State, env: Environment, key: Key) -> Array:
         fiber = model.fiber(loop.params, env)

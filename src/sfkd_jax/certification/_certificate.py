@@ -31,7 +31,7 @@ from sfkd_jax.certification._measured import (
     residuals,
 )
 from sfkd_jax.certification._metrics import prove_lyapunov
-from sfkd_jax.certification._search import joint_bound, prove
+from sfkd_jax.certification._search import prove
 from sfkd_jax.certification._tubes import output_tubes, tubes
 from sfkd_jax.certification._weights import (
     CertificateStale,
@@ -183,24 +183,6 @@ def verify(
             certificate.attack == step and certificate.tightness == tightness,
             "attack or tightness does not follow from the attacks",
         )
-
-
-@one_thread()
-def contraction_metrics(model: Model, params: Params) -> dict[str, float]:
-    """Return a quick estimate of "alpha" for the log of a training run; no certificate.
-
-    Empty if nothing can be proved.
-    """
-    try:
-        weights = exported(model, params)
-    # A model without explicit weights trains like any other, just without this log.
-    except CertificationRefused:
-        return {}
-    known = weights.residual_multipliers
-    # Multipliers of the model itself prove what it promises.
-    alpha, _ = joint_bound(weights, known, iterations=0 if known else 15)
-    # JSON has no infinity: what is not proved is absent.
-    return {"alpha": alpha} if np.isfinite(alpha) else {}
 
 
 def issue(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from scipy.special import betaincinv
 
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
-from sfkd_jax.rollout import predictions
+from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 
 KINDS = ("latent", "position", "yaw", "body")
@@ -66,7 +66,7 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
     """`residuals` of one batch of fixed size."""
 
     def one(run: Trajectory) -> tuple[Array, Array]:
-        known = predictions(model, params, run)
+        known = rollout(model, params, run)
         before, after = run.states[:-1], run.states[1:]
         miss = (known.single - after)[:, BODY]
         if model.along_path:

@@ -67,15 +67,13 @@ def prove(weights: Exported) -> Claims:
 
 
 def joint_bound(
-    weights: Exported, start: Sequence[Vector], *, iterations: int = 150
+    weights: Exported, start: Sequence[Vector]
 ) -> tuple[float, list[list[Vector]]]:
     """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex."""
     bounds, witnesses = [], []
     for vertex in weights.operators.vertices:
         # From the answer of the last vertex: operators and multipliers are alike.
-        start = propose_multipliers(
-            weights.residual, start, vertex, iterations=iterations
-        )
+        start = propose_multipliers(weights.residual, start, vertex)
         bound, start = lipschitz_upper(weights.residual, start, vertex)
         bounds.append(bound)
         witnesses.append(start)
@@ -133,8 +131,6 @@ def propose_multipliers(
     weights: Sequence[Matrix],
     start: Sequence[Vector] = (),
     linear: Matrix | None = None,
-    *,
-    iterations: int = 150,
 ) -> list[Vector]:
     """Return multipliers near the LipSDP optimum, by L-BFGS over their logarithms.
 
@@ -142,8 +138,7 @@ def propose_multipliers(
     Schur complement C'S⁻¹C − K. With a top eigenvector v and the hidden values
     y = −S⁻¹Cv, its gradient is dλ_k ↦ −2 y_k ∘ (y_k − W_k y_{k−1}).
 
-    Without `start` the search begins at those that prove the product of norms;
-    `iterations` are for each exponent in `SHARPNESS`.
+    Without `start` the search begins at those that prove the product of norms.
     """
     weights = [np.asarray(weight, dtype=np.float64) for weight in weights]
     if len(weights) < 2 or not all(np.all(np.isfinite(part)) for part in weights):
@@ -171,7 +166,7 @@ def propose_multipliers(
         value = 0.5 * (np.log(largest) + np.log(total) / sharpness)
         return value, 0.5 * np.concatenate(gradient)
 
-    options = {"maxiter": iterations, "maxcor": 30}
+    options = {"maxiter": 150, "maxcor": 30}
     # Smooth first: a sharp p-norm has a gradient of the top vector alone.
     for sharpness in SHARPNESS:
         search = {"args": (sharpness,), "method": "L-BFGS-B", "options": options}

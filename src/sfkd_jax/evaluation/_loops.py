@@ -235,7 +235,7 @@ def open_loop(
     windows = adjacent_windows(trajectories, length=horizon)
 
     def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
-        predicted, true = rollout(model, params, window), window.states[1:]
+        predicted, true = rollout(model, params, window).free, window.states[1:]
         if not model.along_path:
             return state_errors(predicted, true)[:, :4] ** 2
         gap = (predicted - true)[:, BODY]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.certification import CertificationRefused, contraction_metrics, issue
+from sfkd_jax.certification import CertificationRefused, issue
 from sfkd_jax.certification.corridor import certify_corridor, check_count, closed_loop
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import (
@@ -157,7 +157,6 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
             held_out,
             key,
             run_dir,
-            inspect=partial(contraction_metrics, model),
             **arguments(options, fit),
         )
     if model.planning is not None:

@@ -54,7 +54,6 @@ def fit(
     clip_norm: Positive = 100.0,
     log_every: int = 50,
     save_every: int = 500,
-    inspect: Callable[[Params], dict[str, float]] | None = None,
 ) -> tuple[Params, int]:
     """Train and return the parameters with the lowest validation loss.
 
@@ -78,8 +77,6 @@ def fit(
         clip_norm: largest global gradient norm.
         log_every: steps per compiled chunk and per log line, which divides `steps`.
         save_every: steps per checkpoint, a multiple of `log_every`.
-        inspect: params -> more finite numbers to log at every checkpoint, by name (what
-            can be certified, for example).
 
     Returns:
         The best parameters, and the step at which they were reached.
@@ -134,8 +131,9 @@ def fit(
                 total, parts, _ = loss.validate(state.params, held_out)
                 record["validation_loss"] = float(total)
                 record["validation_prediction"] = float(parts["prediction"])
-                record |= inspect(state.params) if inspect else {}
-            # Every entry, also of `inspect`: a NaN there means bad parameters as well.
+                # What the model promises; a certificate may prove less.
+                if rate := model.structure.rate:
+                    record["alpha"] = float(rate(state.params))
             if not all(map(math.isfinite, record.values())):
                 raise TrainingStopped(
                     f"non-finite loss near step {done}; the last good checkpoint "

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
-from sfkd_jax.rollout import Folded, fold, predictions, rollout, state_errors
+from sfkd_jax.rollout import Folded, fold, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
 
 Parts: TypeAlias = dict[str, Scalar]
@@ -160,7 +160,7 @@ def one_step_loss(model: Model) -> Loss:
     """
 
     def error(params: Params, data: Trajectory) -> Scalar:
-        after = rollout(model, params, data)
+        after = rollout(model, params, data).single
         # In the frame of the car, as the scale is.
         gap = state_errors(after, data.states[1:])
         return jnp.mean((gap / jax.lax.stop_gradient(params["scale"])) ** 2)
@@ -180,7 +180,7 @@ def planning_loss(model: Model, params: Params, space: Space) -> Loss:
 
     def error(weights: Params, data: Trajectory) -> Scalar:
         own = Folded({**params, "planning": weights}, frozen.shared)
-        after = rollout(planning, own, data)
+        after = rollout(planning, own, data).single
         return jnp.mean((state_errors(after, data.states[1:]) * units) ** 2)
 
     return _mean_of(error)
@@ -206,7 +206,7 @@ def _window_parts(
     other: Environment,
 ) -> dict[str, Array]:
     """The parts of the loss of one window; `other` is another window's environment."""
-    known = predictions(model, params, data)
+    known = rollout(model, params, data)
     errors = state_errors(known.free, data.states[1:])
 
     def prediction(growth: float) -> Scalar:
