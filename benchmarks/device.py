@@ -170,9 +170,10 @@ def compared(name, count, seed):
         drive = fresh_episodes(loaded(name, **own), ROADS[name], 30.0)
         errors = rmse_mm(drive(keys)[:, SETTLED:])
         law = errors if law is None else law
-        ratio, spread = np.mean(errors / law), np.std(errors / law) / np.sqrt(count)
+        ratio = errors / law
         row = {"planner": label, "median_ms": took, "rmse_mm": float(np.mean(errors))}
-        yield row | {"over_law": float(ratio), "standard_error": float(spread)}
+        spread = float(np.std(ratio, ddof=1) / np.sqrt(count))
+        yield row | {"over_law": float(np.mean(ratio)), "standard_error": spread}
 
 
 def main():
@@ -185,11 +186,8 @@ def main():
         if asked.planners:
             found = {"planners": list(compared(name, asked.planners, asked.seed))}
         else:
-            step, sizes = (
-                partial(control_step, name, asked.steps),
-                scales(asked.samples),
-            )
-            found = {"control_step": [step(**one) for one in sizes]}
+            step = partial(control_step, name, asked.steps)
+            found = {"control_step": [step(**one) for one in scales(asked.samples)]}
             if asked.episodes:
                 about = asked.samples[0], asked.episodes, asked.seed
                 found["s3"] = episodes(name, *about)
