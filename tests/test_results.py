@@ -106,11 +106,11 @@ def test_what_adaptation_brings():
         knows, _, ours = errors(car, case)
         return ours / knows
 
-    for car in ("dynamic", "kinematic"):
+    for car, share in (("dynamic", 0.95), ("kinematic", 0.75)):
         knows, blind, ours = errors(car, "force, 3 s")
-        assert (blind - ours) / (blind - knows) > 0.8
+        assert (blind - ours) / (blind - knows) > share
     for case in ("mass + 30 %", "steering + 1 degree", "wheelbase + 5 %"):
         assert ratio("dynamic", case) < 1.205
-    assert round(ratio("dynamic", "stiffness - 30 %"), 2) == 1.25
+    assert ratio("dynamic", "stiffness - 30 %") < 1.205
     assert round(ratio("dynamic", "e not measured"), 1) == 1.2
     assert 2.0 < ratio("kinematic", "e not measured") < 2.2
