@@ -29,6 +29,7 @@ DEFAULTS = dict(samples=[1500], steps=200, episodes=16, planners=0, seed=2026)
 HORIZON, SETTLED, PERIOD = 20, 20, 0.1
 """Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
 PLANNERS = {"law alone": {"num_samples": 1}}
+"""What differs from the shipped planner."""
 for n in (16, 300, 1500):
     PLANNERS[f"MPPI, {n}"] = {"num_samples": n}
 for n in (16, 1500):
@@ -36,7 +37,6 @@ for n in (16, 1500):
 PLANNERS["CEM, 3×500"] = {"planner": "cem", "num_samples": 500, "elites": 50}
 for n in (1, 5):
     PLANNERS[f"gradient, {n}"] = {"planner": "gradient", "iterations": n}
-"""What differs from the shipped planner."""
 ROADS = {"dynamic": "s3", "kinematic": "s2"}
 """Scenarios on which planners are compared."""
 
@@ -184,7 +184,8 @@ def main():
         device = f"{jax.device_count()} x {device}"
     for name in asked.cars:
         if asked.planners:
-            found = {"planners": list(compared(name, asked.planners, asked.seed))}
+            about = asked.planners, asked.seed
+            found = {"roads, seed": about, "planners": list(compared(name, *about))}
         else:
             step = partial(control_step, name, asked.steps)
             found = {"control_step": [step(**one) for one in scales(asked.samples)]}
