@@ -243,6 +243,8 @@ def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
         ("mppi", {"noise": "pink"}, "noise must be one of"),
         ("mppi", {"noise": "spline", "noise_knots": 13}, "noise_knots"),
         ("mppi", {"noise_std": (0.0,)}, "noise_std"),
+        ("mppi", {"smoothing_window": 6}, "smoothing_window"),
+        ("mppi", {"smoothing_window": 13}, "smoothing_window"),
         ("cem", {"elites": 1000}, "elites"),
         ("gradient", {"shrink": 1.0}, "shrink"),
     ],

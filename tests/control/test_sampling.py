@@ -10,6 +10,7 @@ from sfkd_jax.control.planners._sampling import (
     KINDS,
     SamplingPlanner,
     effective_sample_size,
+    savitzky_golay,
     shrunk,
     softmin,
     temperature_for,
@@ -46,6 +47,19 @@ def test_noise_forgets_at_its_rate(kind, rate):
     lag = np.abs(np.subtract.outer(np.arange(HORIZON), np.arange(HORIZON)))
     seen = np.corrcoef(drawn(kind)[:, :, 0])
     np.testing.assert_allclose(seen, np.where(lag == 0, 1.0, rate**lag), atol=0.07)
+
+
+# ---- smoothing
+
+
+def test_smoothing_has_the_published_weights_and_keeps_quadratics():
+    table = savitzky_golay(HORIZON, 5)
+    # Savitzky and Golay (1964), table I: five points, quadratic.
+    published = np.array([-3.0, 12.0, 17.0, 12.0, -3.0]) / 35.0
+    np.testing.assert_allclose(table[9, 7:12], published, atol=1e-12)
+    np.testing.assert_allclose(np.delete(table[9], range(7, 12)), 0.0)
+    quadratics = np.vander(np.arange(HORIZON), 3)
+    np.testing.assert_allclose(table @ quadratics, quadratics, atol=1e-9)
 
 
 # ---- weights

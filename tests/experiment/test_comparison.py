@@ -9,7 +9,7 @@ import pytest
 from composing import settings
 from helpers import last_line, run_command
 
-from sfkd_jax.experiment import comparing
+from sfkd_jax.experiment import command, comparing
 from sfkd_jax.experiment.runs import provenance
 from sfkd_jax.settings import replace
 from sfkd_jax.store import write_json
@@ -43,6 +43,26 @@ def test_every_row_has_every_scenario_under_each_of_its_controllers():
     groups = comparing.group_cells(found)
     assert [cell for group in groups for cell in group] == found
     assert len(groups) == 2 * 2 * (2 + 1)
+
+
+PUBLISHED = [
+    path.stem
+    for path in sorted(Path(command.conf_path(), "experiment").glob("*.yaml"))
+    if "comparison" in path.read_text("utf-8")
+]
+"""Experiments that compare rows."""
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_every_row_of_every_comparison_composes(name):
+    """One cell a row and vehicle; a controller of its own belongs to a row."""
+    comparison = settings(f"+experiment={name}").comparison
+    one_a_row = {}
+    for cell in comparing.list_cells(comparison):
+        one_a_row.setdefault(cell[:2], cell)
+    assert {label for _, label in one_a_row} == set(comparison.rows)
+    for cell in one_a_row.values():
+        settings(f"+experiment={name}", *comparing.overrides(cell, comparison))
 
 
 def test_a_row_that_is_not_trained_again_has_the_first_seed_alone():

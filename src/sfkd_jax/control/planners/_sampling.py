@@ -23,7 +23,14 @@ from sfkd_jax.control.planners._planner import (
     replace_nonfinite,
     tuned,
 )
-from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Positive, UnitInterval, check_choice
+from sfkd_jax.ranges import (
+    AtLeastOne,
+    AtLeastTwo,
+    NonNegativeInt,
+    Positive,
+    UnitInterval,
+    check_choice,
+)
 from sfkd_jax.types import Control, Key, Scalar
 
 DEVICES = "samples"
@@ -127,6 +134,24 @@ def spline(horizon: int, knots: int) -> Float[np.ndarray, "horizon knots"]:
     return factor
 
 
+def savitzky_golay(horizon: int, window: int) -> Float[np.ndarray, "horizon horizon"]:
+    """Weights of a plan in its smoothed plan, a quadratic fitted around every step.
+
+    In the first and last half of a window, the quadratic of the first and last window.
+
+    Source: Savitzky and Golay (1964); of plans, Williams et al. (2018).
+    """
+    half = window // 2
+    # The projection onto quadratics; scaled to [-1, 1], so that it is well conditioned.
+    basis, _ = np.linalg.qr(np.vander(np.arange(-half, half + 1) / half, 3))
+    fit = basis @ basis.T
+    table = np.zeros((horizon, horizon))
+    for step in range(horizon):
+        first = int(np.clip(step - half, 0, horizon - window))
+        table[step, first : first + window] = fit[step - first]
+    return table
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mppi(SamplingPlanner):
     """Information-theoretic MPPI.
@@ -143,6 +168,8 @@ class Mppi(SamplingPlanner):
             has this value; 0 keeps λ at `temperature`. Both are data, see `Tuning`.
         shrinkage: whether the mean moves away from the plan only as far as its variance
             lets it, see `shrunk`: few samples then do no harm.
+        smoothing_window: steps of the window of `savitzky_golay`, which the mean passes
+            through; 0 for none.
 
     Source: Williams et al. (2018), Information-Theoretic MPC, T-RO 34(6).
     """
@@ -150,13 +177,21 @@ class Mppi(SamplingPlanner):
     temperature: Positive = 5.0
     effective_samples: float = 0.0
     shrinkage: bool = False
+    smoothing_window: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        size, most = self.effective_samples, self.num_samples
-        if size and not 1 <= size <= most:
+        size = self.effective_samples
+        if size and not 1 <= size <= self.num_samples:
             raise ValueError(
-                f"effective_samples must be 0 or lie in [1, {most}], got {size}"
+                f"effective_samples must be 0 or lie in [1, {self.num_samples}], "
+                f"got {size}"
+            )
+        window = self.smoothing_window
+        if window and not (window % 2 == 1 and 5 <= window <= self.horizon):
+            raise ValueError(
+                "smoothing_window must be 0 or an odd number in "
+                f"[5, {self.horizon}], got {window}"
             )
 
     def init(self, key: Key) -> PlannerState:
@@ -198,6 +233,13 @@ class Mppi(SamplingPlanner):
                 # The noise of earlier steps ends where the law alone is as good.
                 best = jnp.where(ranks[1] <= ranks[0], allowed[:, 1], allowed[:, 0])
                 mean = shrunk(mean, best, weights, allowed)
+            if self.smoothing_window:
+                table = savitzky_golay(self.horizon, self.smoothing_window)
+                mean = jnp.matmul(
+                    jnp.asarray(table, dtype=float),
+                    mean,
+                    precision=jax.lax.Precision.HIGHEST,
+                )
             return mean, SearchResult(
                 plan=mean,
                 usable=usable,
