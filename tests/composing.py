@@ -9,9 +9,15 @@ from sfkd_jax.store import plain
 
 
 @cache
+def _registered():
+    """Hydra's schemas, made once a process."""
+    options.register()
+
+
+@cache
 def composed(*overrides):
     """The configuration before it is checked."""
-    options.register()
+    _registered()
     with initialize_config_dir(command.conf_path(), version_base="1.3"):
         return compose("config", overrides=list(overrides))
 
