@@ -38,7 +38,8 @@ def wrap_angle(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
 def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, " 2"]:
     """Return R(angle) vector."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
+    c = jnp.cos(angle)
+    s = jnp.sin(angle)
     return jnp.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
@@ -156,7 +157,9 @@ def circle_errors(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
             at the origin.
         curvature: κ [1/m], left positive.
     """
-    x, y, yaw = pose[0], pose[1], pose[2]
+    x = pose[0]
+    y = pose[1]
+    yaw = pose[2]
     q = curvature * (x**2 + y**2) - 2.0 * y
     # 1 + κ q is the squared distance to the centre in radii;
     # limited before the root, whose gradient at 0 is infinite.
@@ -291,7 +294,8 @@ def closed_loop(
         high: upper limits of the vehicle's controls.
     """
     along = path_step(step)
-    bottom, top = jnp.asarray(low), jnp.asarray(high)
+    bottom = jnp.asarray(low)
+    top = jnp.asarray(high)
 
     def closed(state: State, inputs: Control, env: Environment) -> State:
         curvature = inputs[CURVATURE]

@@ -81,7 +81,8 @@ def outside_box(
         left: across it [m].
         half: half of length and width [m].
     """
-    along, left = jnp.abs(along) - half[0], jnp.abs(left) - half[1]
+    along = jnp.abs(along) - half[0]
+    left = jnp.abs(left) - half[1]
     # Outside: distance to the nearest corner or side; inside: to the nearest side.
     corner = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(left, 0.0) ** 2
     # Finite derivatives in the corner too.
@@ -117,7 +118,8 @@ def place_at(
     obstacle: Obstacles, step: Float[Array, ...] | float
 ) -> tuple[Float[Array, ...], Float[Array, ...]]:
     """Return where one obstacle, a row of `Obstacles`, is after some steps [m]."""
-    places, last = obstacle.position, obstacle.position.shape[0] - 1
+    places = obstacle.position
+    last = obstacle.position.shape[0] - 1
     if not last:
         # What stands still is not looked up for every sample.
         return places[0, 0], places[0, 1]
@@ -146,7 +148,8 @@ def beside(
     """
     x, y = jax.vmap(lambda one: place_at(one, step))(obstacles)
     x, y = (place.reshape(len(place), -1) for place in (x, y))
-    x, y = x - line[0], y - line[1]
+    x = x - line[0]
+    y = y - line[1]
     nearest = jnp.argmin(jnp.hypot(x, y), axis=1)
     left = direction[0] * y - direction[1] * x
     return nearest, left[jnp.arange(len(left)), nearest]
@@ -161,8 +164,10 @@ def distance(
 ) -> Float[Array, ...]:
     """Return the `clearance` from one obstacle, a row of `Obstacles`, at its place."""
     x, y = (a - b for a, b in zip(place, position, strict=True))
-    (cos, sin), (length, width) = direction, obstacle.half
-    their_cos, their_sin = jnp.cos(obstacle.yaw), jnp.sin(obstacle.yaw)
+    (cos, sin) = direction
+    (length, width) = obstacle.half
+    their_cos = jnp.cos(obstacle.yaw)
+    their_sin = jnp.sin(obstacle.yaw)
     parallel = jnp.abs(their_cos * cos + their_sin * sin)
     across = jnp.abs(their_sin * cos - their_cos * sin)
     # Half of each box, and of the smallest one around the other that is parallel to it.
@@ -182,7 +187,8 @@ def finite(
     lane: Lane, obstacles: Obstacles
 ) -> tuple[tuple[Lane, Obstacles], Bool[Array, ""]]:
     """Return a finite scene, and whether it was one; padding may hold anything."""
-    points, count = lane.path.points.shape[0], obstacles.position.shape[0]
+    points = lane.path.points.shape[0]
+    count = obstacles.position.shape[0]
     sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
     rows = {leaf.shape[0] for leaf in obstacles}
     if sizes != {(points,)} or rows != {count} or obstacles.position.ndim != 3:

@@ -86,7 +86,8 @@ def path_through(
     x, y = (jnp.interp(s, along, axis) for axis in points.T)
     if closed:  # goes on by two samples at both ends, for the differences
         x, y = (jnp.concatenate([one[-3:-1], one, one[1:3]]) for one in (x, y))
-    along_x, along_y = jnp.asarray(jnp.gradient(x)), jnp.asarray(jnp.gradient(y))
+    along_x = jnp.asarray(jnp.gradient(x))
+    along_y = jnp.asarray(jnp.gradient(y))
     # Unwrapped: the curvature is its slope, which must not jump by 2π.
     yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
     curvature = jnp.asarray(jnp.gradient(yaw)) / spacing
@@ -108,7 +109,8 @@ def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
         return point.at[2].add(laps * (path.points[-1, 2] - path.points[0, 2]))
     last = path.points.shape[0] - 2
     index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
-    start, end = path.points[index], path.points[index + 1]
+    start = path.points[index]
+    end = path.points[index + 1]
     # Clipped: beyond its ends a path stays at its last point.
     ahead = jnp.clip(s - index * path.spacing, 0.0, path.spacing)
     slope = (end[3] - start[3]) / path.spacing
@@ -167,7 +169,8 @@ def reference_window(
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     speeds = jnp.broadcast_to(speed, ahead.shape)
     if not isinstance(path, Lap):
-        left, braking = jnp.maximum(path.length - s, 0.0), speed**2 / 2 / deceleration
+        left = jnp.maximum(path.length - s, 0.0)
+        braking = speed**2 / 2 / deceleration
         # Until standstill: cruise and brake, or brake alone where the end is near.
         until = jnp.where(
             left > braking,
@@ -197,7 +200,8 @@ def quintic(
         length: of the move, positive [m].
         s: distance from its start, not negative [m].
     """
-    first, second = start[1] * length, 0.5 * start[2] * length**2
+    first = start[1] * length
+    second = 0.5 * start[2] * length**2
     gap = target - start[0]
     # Over t = s / length in [0, 1], or the powers would span many decades.
     cubic = 10.0 * gap - 6.0 * first - 3.0 * second
@@ -206,7 +210,8 @@ def quintic(
     coefficients = (fifth, quartic, cubic, second, first, start[0])
     t = jnp.clip(s / length, 0.0, 1.0)
     # At the end all derivatives are those of staying there, the third included.
-    values, scale = [], jnp.where(s < length, 1.0, 0.0)
+    values = []
+    scale = jnp.where(s < length, 1.0, 0.0)
     for order in range(4):
         value = jnp.zeros_like(t)
         for coefficient in coefficients:
@@ -224,6 +229,8 @@ def _offsets(
     point: Float[Array, " 4"], position: Float[Array, " 2"]
 ) -> tuple[Scalar, Scalar]:
     """Distance of a position ahead of and left of a point on the path [m]."""
-    dx, dy = position[0] - point[0], position[1] - point[1]
-    c, s = jnp.cos(point[2]), jnp.sin(point[2])
+    dx = position[0] - point[0]
+    dy = position[1] - point[1]
+    c = jnp.cos(point[2])
+    s = jnp.sin(point[2])
     return c * dx + s * dy, -s * dx + c * dy

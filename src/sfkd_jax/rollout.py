@@ -93,7 +93,8 @@ def with_offset(model: Model) -> Model:
         return jax.tree.map(jnp.add, after, fiber.shift)
 
     def fiber(params: Offset, env: Environment) -> Offset:
-        own, shift = model.fiber(params.params, env), params.shift
+        own = model.fiber(params.params, env)
+        shift = params.shift
         # By each model: what guards has another latent than what plans.
         if shift is not None:
             at, by = shift
@@ -104,7 +105,8 @@ def with_offset(model: Model) -> Model:
         # Everything else sees the model's own parameters or fiber.
         return function and (lambda offset, *rest: function(offset.params, *rest))
 
-    structure, on_road = model.structure, model.on_road
+    structure = model.structure
+    on_road = model.on_road
     return model._replace(
         # A scalar 0 broadcasts over any control, whose size is not known here.
         init=lambda key: Offset(model.init(key), jnp.zeros(()), None),

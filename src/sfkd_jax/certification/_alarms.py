@@ -71,7 +71,8 @@ def sensor_effect(
     loop: Loop, key: Key, state: State, inputs: Control, env: Environment
 ) -> Array:
     """Return the change of ν because the law reads ξ through the sensors."""
-    coordinates, road = state[BODY], inputs[PERTURBATION.stop :]
+    coordinates = state[BODY]
+    road = inputs[PERTURBATION.stop :]
     spread = spread_of(loop.noise, state.shape[-1])[BODY]
     measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
     # A law is a known function: reading ξ + n acts like a perturbation of ν.
@@ -95,7 +96,8 @@ def simulate_nominal(
 
     ẑ_0 is the latent state of a nominal model that starts at the measured state.
     """
-    model, spread = loop.model, spread_of(loop.noise, runs.states.shape[-1])
+    model = loop.model
+    spread = spread_of(loop.noise, runs.states.shape[-1])
 
     def lateral(run: Trajectory) -> Array:
         return rollout(model, loop.params, run).free[:, BODY][:, LATERAL]
@@ -117,13 +119,15 @@ def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:
 
     `key` made the runs: one half of it drew the environments, the other one the rest.
     """
-    model, law = loop.model, loop.law
+    model = loop.model
+    law = loop.law
     keys = sensor_keys(jax.random.split(key)[1], *runs.controls.shape[:2])
     spread = spread_of(loop.noise, runs.states.shape[-1])[BODY]
     noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
 
     def step(xi: Array, after: Array, inputs: Array, env: Array) -> tuple[Array, Array]:
-        fiber, road = model.fiber(loop.params, env), inputs[2:]
+        fiber = model.fiber(loop.params, env)
+        road = inputs[2:]
         # ν beside the law of what was measured: the noise in the control cancels.
         expected = expected_coordinates(model, fiber, xi, inputs[:2], road)
         turn = law.turn(road[0], road[1], env)
@@ -187,7 +191,8 @@ def calibrate_innovations(
     maxima = np.concatenate([*map(largest, parts)], dtype=np.float64)
     reference, scores = np.array_split(maxima, 2)
     thresholds = MARGIN * alarm_thresholds(reference, scores, rate=duration / DAY)
-    test, s3 = largest(observe(test_key)), largest(observe_s3(s3_key))
+    test = largest(observe(test_key))
+    s3 = largest(observe_s3(s3_key))
     return {
         "levels": levels.tolist(),
         "deviation": np.stack(deviation).tolist(),

@@ -39,7 +39,8 @@ def attack_claims(
 ) -> dict[str, float]:
     """Run all attacks and return the lower bounds that they reach, by name."""
     # Limits before the search: a proof that states none is an error at once.
-    limits, reached = attack_limits(claims, weights), {}
+    limits = attack_limits(claims, weights)
+    reached = {}
     networks = {"residual": weights.residual, **decoders(weights)}
     for name, network in networks.items():
         if network:
@@ -74,7 +75,8 @@ def attack_slopes(
     # Without a network the operator alone is the map, and there are no slopes.
     if not weights:
         return float(np.linalg.norm(np.asarray(linear), 2))
-    random, best = np.random.default_rng(0), 0.0
+    random = np.random.default_rng(0)
+    best = 0.0
     base = 0.0 if linear is None else np.asarray(linear)
     for start in range(starts):
         # All slopes 1 is the linearisation at the origin, often close to the worst.
@@ -130,7 +132,8 @@ def attack_model(
     step_key, transport_key, output_key = jax.random.split(jax.random.key(0), 3)
 
     def step(params: Params, z: Any, control: Any, env: Any, later: Any) -> Any:
-        fiber, fiber_next = model.fiber(params, env), model.fiber(params, later)
+        fiber = model.fiber(params, env)
+        fiber_next = model.fiber(params, later)
         after = model.step(fiber, inject(z), control)
         return model.vector(model.transport(fiber, fiber_next, after))
 
@@ -156,7 +159,8 @@ def attack_model(
     carried = jax.jit(jax.vmap(transport, in_axes=(None, 0)))(params, pairs)
     ends = steepest(outputs, key=output_key, iterations=60)
     if model.along_path:  # decoded from z: e_y, e_ψ, then the vehicle's own state
-        poses, parts = ends, {"position": slice(6, 7), "yaw": slice(7, 8)}
+        poses = ends
+        parts = {"position": slice(6, 7), "yaw": slice(7, 8)}
     else:
         # Rows 0-2: the pose after a step; 3-5: that of decoding, constant unless in z.
         poses = [part for jacobian in ends for part in (jacobian[:3], jacobian[3:6])]
@@ -200,7 +204,9 @@ def _steepest(
 
     # The ascent is over the direction as well: no singular vectors, a smooth objective.
     def loss(params: Params, point: Any) -> Any:
-        z, rest, direction = point[:rank], point[rank:inputs], point[inputs:]
+        z = point[:rank]
+        rest = point[rank:inputs]
+        direction = point[inputs:]
         _, gain = jax.jvp(lambda z: at(params, z, rest), (z,), (direction,))
         return 0.5 * (
             # A logarithm: far from the maximum slopes differ by orders of magnitude.
@@ -250,7 +256,8 @@ def _coordinates(
     assert model.structure.explicit is not None
     # Shapes only: no weights are computed to learn sizes.
     weights = jax.eval_shape(model.structure.explicit, params)
-    state, env = jnp.zeros(3 + weights.readout.shape[0]), jnp.zeros(entries)
+    state = jnp.zeros(3 + weights.readout.shape[0])
+    env = jnp.zeros(entries)
     shapes = jax.eval_shape(lambda: model.encode(model.fiber(params, env), state))
     origin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     # `vector` is linear, so that its transpose writes z and leaves the pose at 0.

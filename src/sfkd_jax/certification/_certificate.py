@@ -162,7 +162,8 @@ def verify(
     weights = exported(model, params) if weights is None else weights
     with well_formed(), one_thread():
         require_claims(certificate, weights, certificate.env_box)
-        alpha, limits = certificate.alpha, attack_limits(certificate, weights)
+        alpha = certificate.alpha
+        limits = attack_limits(certificate, weights)
         require(
             alpha < 1.0 and certificate.transport_lipschitz == 1.0,
             f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
@@ -221,18 +222,22 @@ def issue(
     began = time.perf_counter()
     # First the proof: where it refuses, nothing need be measured.
     certificate = certify(model, params, boxes["env"], attack_starts=attack_starts)
-    weights, start = with_room(exported(model, params)), None
+    weights = with_room(exported(model, params))
+    start = None
     try:
         claim = prove_lyapunov(weights)
-        lyapunov, start = claim.document(), claim.metric
+        lyapunov = claim.document()
+        start = claim.metric
     # Nothing else depends on it, so that a missing solver does not stop the rest.
     except CertificationRefused as reason:
         lyapunov = {"reason": str(reason)}
     # Folded for measurements alone: the proof is about the stored weights.
     measure = partial(residuals, model, fold(model, params, on_host))
-    reference, scores = measure(validation), measure(calibration)
+    reference = measure(validation)
+    scores = measure(calibration)
     unseen = {name: measure(part) for name, part in held_out.items()}
-    outputs, largest = {}, None
+    outputs = {}
+    largest = None
     try:
         d_bar = _one_step_bounds(reference, scores, unseen, level, runs or {})
         if model.along_path and keeps_metrics(weights):
@@ -274,7 +279,8 @@ def _one_step_bounds(
     runs: Mapping[str, int],
 ) -> dict[str, Any]:
     """Bounds at `level` for whole trajectories, and their coverage."""
-    units, scores = reference.largest(), measured.largest()
+    units = reference.largest()
+    scores = measured.largest()
     # Units from validation, or the scores of calibration would not be exchangeable.
     bounds = conformal_bounds(units, scores, level=level)
     # Only of the test part it is known how many runs it was cut from.

@@ -70,15 +70,18 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
     for name, value in constants.items():
         bound = isinstance(value, int | float) and 0 <= value < math.inf
         require(bound, f"{name} is not a bound: {value!r}")
-    linear, networks = readouts(weights), decoders(weights)
+    linear = readouts(weights)
+    networks = decoders(weights)
     # Exactly these outputs: a missing one would be unbounded, another one meaningless.
-    expected, actual = [*linear, *networks], [*claims.lipschitz]
+    expected = [*linear, *networks]
+    actual = [*claims.lipschitz]
     require(
         set(actual) == {*expected},
         f"lipschitz must be of {', '.join(expected)}, got {actual}",
     )
     require_box("env_box", box)
-    witness, vertices = claims.witnesses, list(weights.operators.vertices)
+    witness = claims.witnesses
+    vertices = list(weights.operators.vertices)
     residual = vectors(witness["residual"])
     joint = [vectors(each) for each in witness["joint"]]
     # Operators alone, without a network: no multipliers at any vertex.

@@ -67,7 +67,8 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
 
     def one(run: Trajectory) -> tuple[Array, Array]:
         known = rollout(model, params, run)
-        before, after = run.states[:-1], run.states[1:]
+        before = run.states[:-1]
+        after = run.states[1:]
         miss = (known.single - after)[:, BODY]
         if model.along_path:
             # Path states have their outputs in the body, without a pose.
@@ -200,7 +201,8 @@ def coverage_interval(share: float, runs: int) -> list[float]:
     If the share lies between two counts of runs, the interval covers those of both.
     """
     # Both sides rounded outwards: the interval is wider than either count's.
-    few, many = math.floor(share * runs + ROUNDING), math.ceil(share * runs - ROUNDING)
+    few = math.floor(share * runs + ROUNDING)
+    many = math.ceil(share * runs - ROUNDING)
     # At 0 and 1 the ends are exact, where betaincinv is undefined.
     low = betaincinv(few, runs - few + 1, 0.025) if few else 0.0
     high = betaincinv(many + 1, runs - many, 0.975) if many < runs else 1.0

@@ -88,7 +88,8 @@ def solve_metric(operators: Sequence[Matrix], rate: float) -> Matrix | None:
         raise CertificationRefused(MISSING) from None
     require("CLARABEL" in cp.installed_solvers(), MISSING)
     identity = np.eye(len(operators[0]))
-    metric, condition = cp.Variable(identity.shape, symmetric=True), cp.Variable()
+    metric = cp.Variable(identity.shape, symmetric=True)
+    condition = cp.Variable()
     # I ⪯ P fixes the scale, which is free otherwise, and makes κ the condition.
     bounds: list[Any] = [metric >> identity, condition * identity - metric >> 0]
     decreases = [
@@ -109,7 +110,8 @@ def solve_metric(operators: Sequence[Matrix], rate: float) -> Matrix | None:
 
 def _accepted_lyapunov(metric: Matrix, weights: Exported) -> LyapunovClaim | None:
     """The smallest constants of a proposed P that the core accepts, or None."""
-    metric, vertices = np.asarray(metric, dtype=np.float64), weights.operators.vertices
+    metric = np.asarray(metric, dtype=np.float64)
+    vertices = weights.operators.vertices
     if metric.shape != vertices.shape[1:] or not np.all(np.isfinite(metric)):
         return None
     # Symmetric before eigenvalues, which read one triangle only.
@@ -165,8 +167,10 @@ def propose_metric(
     `rows` is C, `gaps` are d of the worst steps of every run, not of the calibration
     split. The search starts at `start`, the Lyapunov matrix of the operators, or at I.
     """
-    vertices, multipliers = weights.operators.vertices, weights.residual_multipliers
-    rank, lower = vertices.shape[-1], np.tril_indices(vertices.shape[-1])
+    vertices = weights.operators.vertices
+    multipliers = weights.residual_multipliers
+    rank = vertices.shape[-1]
+    lower = np.tril_indices(vertices.shape[-1])
     entries = len(lower[0])
     # Logarithms: multipliers stay positive in an unconstrained search.
     logs = [np.log(np.concatenate([*multipliers, []]))] * len(vertices)
@@ -236,7 +240,8 @@ def _log_radius(
     flat: Array, sharpness: Array, operators: Array, weights: Any, read: Any, gaps: Any
 ) -> Array:
     """Logarithm of what `propose_metric` minimises, smoothed, of (L, log λ)."""
-    rank, lower = operators.shape[-1], np.tril_indices(operators.shape[-1])
+    rank = operators.shape[-1]
+    lower = np.tril_indices(operators.shape[-1])
     # L itself, not P: any L gives P = L L' ⪰ 0 without a constraint.
     factor = jnp.zeros((rank, rank)).at[lower].set(flat[: len(lower[0])])
     logs = flat[len(lower[0]) :].reshape(len(operators), -1)
@@ -260,7 +265,8 @@ def _squares(
     rank = len(factor)
     inverse = jax.scipy.linalg.solve_triangular(factor, jnp.eye(rank), lower=True).T
     # L' A L'⁻¹: in these coordinates |·|_P is the 2-norm.
-    linear, layers = factor.T @ operator @ inverse, [*weights]
+    linear = factor.T @ operator @ inverse
+    layers = [*weights]
     edges = np.cumsum([0, rank, *(len(part) for part in layers[:-1])])
     blocks = [slice(a, b) for a, b in pairwise(edges)]
     output = jnp.zeros((rank, edges[-1])).at[:, :rank].set(linear)

@@ -70,7 +70,8 @@ def joint_bound(
     weights: Exported, start: Sequence[Vector]
 ) -> tuple[float, list[list[Vector]]]:
     """Return α of z ↦ A z + r(z) as one map, and multipliers for each vertex."""
-    bounds, witnesses = [], []
+    bounds = []
+    witnesses = []
     for vertex in weights.operators.vertices:
         # From the answer of the last vertex: operators and multipliers are alike.
         start = propose_multipliers(weights.residual, start, vertex)
@@ -198,7 +199,8 @@ def reduced(
     matrix, _ = witness_matrix(weights, multipliers, 0.0, linear)
     widths = np.cumsum([len(part) for part in multipliers], dtype=int)
     inputs = len(matrix) - sum(len(part) for part in multipliers)
-    coupling, lower = matrix[inputs:, :inputs], matrix[inputs:, inputs:]
+    coupling = matrix[inputs:, :inputs]
+    lower = matrix[inputs:, inputs:]
     infeasible = np.full(inputs, np.inf), np.eye(inputs), []
     if not np.all(np.isfinite(matrix)):
         return infeasible

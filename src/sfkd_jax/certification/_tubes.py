@@ -67,7 +67,8 @@ def tubes(
     """
     latent = latent_tube(alpha, one_step["latent"], horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
-    ultimate, limit = one_step["latent"] / (1 - alpha), None
+    ultimate = one_step["latent"] / (1 - alpha)
+    limit = None
     # R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1], [ultimate]])
     radii = {
@@ -149,7 +150,8 @@ def output_tubes(
     """
     documents = {}
     for name in OUTPUTS:
-        rows, gaps = readouts(weights)[name], worst_gaps(validation)
+        rows = readouts(weights)[name]
+        gaps = worst_gaps(validation)
         try:
             claim = propose_metric(weights, rows, gaps, start)
         # Both outputs or none: a corridor needs position and heading.

@@ -121,7 +121,8 @@ def schema(
 
     A new entry is one line here; entries without a rule are refused.
     """
-    lipschitz, step = document["lipschitz"], document["attacks"].get("step")
+    lipschitz = document["lipschitz"]
+    step = document["attacks"].get("step")
     low, high = map(trained.settings["environment"].get, ("low", "high"))
     outputs = [*readouts(weights), *decoders(weights)]
     networks = {"residual": weights.residual, **decoders(weights)}
@@ -196,7 +197,8 @@ def _box(trained: Trained, part: str, reach: float = REACH) -> list[Any]:
     # A channel that never moved has the scale 1, and may have no width.
     inner = np.where(half == 1.0, 0.0, half) - rounding
     outer = reach * half + rounding
-    lower, upper = (centre - outer, centre - inner), (centre + inner, centre + outer)
+    lower = (centre - outer, centre - inner)
+    upper = (centre + inner, centre + outer)
     data = trained.settings.get("dataset", {})
     if part == "control" and trained.law is not None and _is_simulated(trained):
         # ν, κ and v_ref are drawn within limits.
@@ -224,7 +226,8 @@ def _boxes(document: Mapping[str, Any], trained: Trained) -> Rule:
 
 def _covered(stated: Mapping[str, Any], count: Rule, runs: Rule) -> dict[str, Any]:
     """A coverage with its counts, and the interval that follows from them."""
-    share, sizes = stated["coverage"], stated["coverage_trajectories"]
+    share = stated["coverage"]
+    sizes = stated["coverage_trajectories"]
     return {
         "coverage": Measured(0.0, 1.0, whole=sizes),
         "coverage_ci95": Follows(coverage_interval(share, stated["coverage_runs"])),
@@ -235,8 +238,10 @@ def _covered(stated: Mapping[str, Any], count: Rule, runs: Rule) -> dict[str, An
 
 def _one_step(d_bar: Mapping[str, Any], trained: Trained) -> Rule:
     """Bounds on the error of one step, and on which runs they held."""
-    count, test = d_bar["trajectories"], d_bar["coverage_trajectories"]
-    runs, level = d_bar["runs"], d_bar["level"]
+    count = d_bar["trajectories"]
+    test = d_bar["coverage_trajectories"]
+    runs = d_bar["runs"]
+    level = d_bar["level"]
     rules = {
         "value": Follows(d_bar["one_step"]["latent"]),
         "level": Measured(SMALLEST, count / (count + 1)),
@@ -251,9 +256,11 @@ def _one_step(d_bar: Mapping[str, Any], trained: Trained) -> Rule:
     if not _is_simulated(trained):
         return rules
     # Every simulated segment is a run of its own, and all test runs have a label.
-    data, stated = trained.settings["dataset"], d_bar["by_scenario"]
+    data = trained.settings["dataset"]
+    stated = d_bar["by_scenario"]
     *_, calibration, tested = sizes_of_parts(data["segments"], data["shares"])
-    whole, labels = Follows(tested), [name for name in LABELS if name in stated]
+    whole = Follows(tested)
+    labels = [name for name in LABELS if name in stated]
     parts = [stated[name] for name in labels]
     sizes = [part["coverage_trajectories"] for part in parts]
     inside = sum(
@@ -271,7 +278,8 @@ def _one_step(d_bar: Mapping[str, Any], trained: Trained) -> Rule:
 
 def _prediction(document: Mapping[str, Any]) -> Rule:
     """R_k, its limit, and the radii in metres and radians."""
-    tube, lipschitz = document["tube"], document["lipschitz"]
+    tube = document["tube"]
+    lipschitz = document["lipschitz"]
     # With a decoder of increments the length of a step counts; it is measured.
     adds_up = "decoder" in lipschitz
     derived = tubes(
@@ -287,7 +295,8 @@ def _prediction(document: Mapping[str, Any]) -> Rule:
 
 def _output(document: Mapping[str, Any], name: str) -> Rule:
     """The metric of an output, and its tubes with their coverage."""
-    part, runs = document["outputs"][name], document["d_bar"]["coverage_trajectories"]
+    part = document["outputs"][name]
+    runs = document["d_bar"]["coverage_trajectories"]
     intervals = {
         form: coverage_interval(part["coverage"][form], runs) for form in FORMS
     }
@@ -306,15 +315,20 @@ def _output(document: Mapping[str, Any], name: str) -> Rule:
 
 def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
     """The corridor: its bounds, on which runs they held, and how it was attacked."""
-    corridor, d_bar = document["corridor"], document["d_bar"]
-    bounds, attack, level = corridor["bounds"], corridor["attack"], corridor["level"]
-    runs, s3 = Follows(corridor["runs"]), corridor["by_scenario"]["s3"]
+    corridor = document["corridor"]
+    d_bar = document["d_bar"]
+    bounds = corridor["bounds"]
+    attack = corridor["attack"]
+    level = corridor["level"]
+    runs = Follows(corridor["runs"])
+    s3 = corridor["by_scenario"]["s3"]
     tube = bounds["vehicle_to_nominal_position"]
     # Car to nominal model plus nominal model to path: the triangle inequality.
     width = bounds["nominal"] + tube
     # Where all bounds held on all runs, nothing farther was seen.
     covered = corridor["coverage"] == 1.0
-    kinds, everywhere = (*JOINT, *ALONE), len(DRIVES) * corridor["runs"]
+    kinds = (*JOINT, *ALONE)
+    everywhere = len(DRIVES) * corridor["runs"]
     bounds_of: dict[str, Any] = {"bounds": dict.fromkeys(kinds, POSITIVE)}
     parts = [corridor["by_group"][name] for name in DRIVES]
     rules = [bounds_of | _covered(part, runs, runs) for part in parts]
@@ -359,7 +373,8 @@ def _corridor(document: Mapping[str, Any], trained: Trained) -> Rule:
 def _recorded(document: Mapping[str, Any]) -> Rule:
     """The corridor of recorded runs, at a level that so many can support."""
     bounds, about = map(document["recorded"].get, ("bounds", "conditions"))
-    width, count = document["corridor"]["bounds"]["nominal"], about["runs"]
+    width = document["corridor"]["bounds"]["nominal"]
+    count = about["runs"]
     measured = dict.fromkeys(("duration_s", "lateral_m"), POSITIVE)
     tube = bounds["vehicle_to_nominal_position"]
     return {
@@ -387,8 +402,10 @@ def _innovations(corridor: Mapping[str, Any], trained: Trained, runs: int) -> Ru
 
 def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
     """Where the corridor holds: conditions of the data, switching and sensors."""
-    corridor, settings = document["corridor"], trained.settings
-    bounds, stated = corridor["bounds"], corridor["conditions"]
+    corridor = document["corridor"]
+    settings = trained.settings
+    bounds = corridor["bounds"]
+    stated = corridor["conditions"]
     # On every run the nominal model started at a measurement: its error is in the tube.
     alphas = [document["outputs"][name]["alpha"] for name in OUTPUTS]
     position, yaw = (
@@ -400,7 +417,8 @@ def _conditions(document: Mapping[str, Any], trained: Trained) -> Rule:
     data = settings["dataset"]
     given = drive_class(data) | {name: data[name] for name in EXCITATION}
     given["law_model"] = data["law"]["model"]
-    dwell, dt = stated["dwell_s"], settings["vehicle"]["dt"]
+    dwell = stated["dwell_s"]
+    dt = settings["vehicle"]["dt"]
     if contents := settings["vehicle"].get("contents"):
         given["identified_from"] = contents
     return {
@@ -418,7 +436,8 @@ def _asked_for(document: Mapping[str, Any]) -> Rule:
     steps = dict.fromkeys(("runs", "horizon", "attack_steps"), COUNT)
     seconds = {"duration": POSITIVE, "dwell": [POSITIVE, POSITIVE]}
     if made := document.get("corridor"):
-        conditions, sizes = made["conditions"], (made["runs"], made["shield_horizon"])
+        conditions = made["conditions"]
+        sizes = (made["runs"], made["shield_horizon"])
         sizes += (made["attack"]["steps"],)
         steps = {name: Follows(n) for name, n in zip(steps, sizes, strict=True)}
         seconds = {name: Follows(conditions[f"{name}_s"]) for name in seconds}
@@ -449,7 +468,8 @@ def require_entry(where: str, stated: Any, rule: Rule) -> None:
         follows = _equal(stated, rule.value, rule.share)
         require(follows, f"{where} does not follow from the policy and other entries")
     elif isinstance(rule, Measured):
-        low, high = np.asarray(rule.low).tolist(), np.asarray(rule.high).tolist()
+        low = np.asarray(rule.low).tolist()
+        high = np.asarray(rule.high).tolist()
         within = f"{rule.kind.__name__} from {low} to {high}"
         require(_in_range(stated, rule), f"{where} = {stated!a:.60} is no {within}")
     else:

@@ -84,7 +84,8 @@ def exported(model: Model, params: Params) -> Exported:
             f"grid-only evidence: {len(weights.operators.operators)} sampled "
             "environments prove nothing about those in between"
         )
-    activation, transport = weights.declared.activation, weights.declared.transport
+    activation = weights.declared.activation
+    transport = weights.declared.transport
     require(
         activation in ACTIVATIONS,
         f"slopes of the activation {activation!r} are not known in [0, 1]",

@@ -137,13 +137,15 @@ def certify_corridor(
     """
     began = time.perf_counter()
     claims = {n: OutputMetric.from_document(part) for n, part in outputs.items()}
-    low, high = data["env_low"], data["env_high"]
+    low = data["env_low"]
+    high = data["env_high"]
     limits = DriveClass(**drive_class(data))
     excited = {name: data[name] for name in EXCITATION}
     # Streams of their own: the data set's runs must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    steps, dt = round(duration / loop.plant.dt), loop.plant.dt
+    steps = round(duration / loop.plant.dt)
+    dt = loop.plant.dt
     switching = partial(
         random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
     )
@@ -245,7 +247,8 @@ def _worst_group(
     level: float,
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """The bounds of the worst group and their coverage; runs are group after group."""
-    own, shares = {}, {}
+    own = {}
+    shares = {}
     parts = [np.split(part, len(DRIVES)) for part in (units, calibration, test)]
     for name, unit, calibrated, _ in zip(DRIVES, *parts, strict=True):
         unit = unit[np.isfinite(unit[:, 0])]
@@ -334,11 +337,13 @@ class _Search:
         nu, env, road = jnp.split(genes, self._edges[:2])
         # Saturates: the worst ν are mostly at the limits.
         nu = jnp.repeat(jnp.tanh(2.0 * nu).reshape(-1, 2), BLOCK, axis=0)[:LENGTH]
-        low, high = jnp.asarray(data["env_low"]), jnp.asarray(data["env_high"])
+        low = jnp.asarray(data["env_low"])
+        high = jnp.asarray(data["env_high"])
         env = _unit(env).reshape(-1, len(low))
         env = jnp.repeat(env, self.held, axis=0)[:LENGTH]
         fast, wave, phase, tight = _unit(road)
-        (slowest, fastest), (shortest, longest) = data["speed"], data["wavelengths"]
+        (slowest, fastest) = data["speed"]
+        (shortest, longest) = data["wavelengths"]
         speed = slowest + (fastest - slowest) * fast
         wavelength = shortest + (longest - shortest) * wave
         # Fast roads are gentle, as in the conditions of the corridor.
@@ -410,7 +415,9 @@ def outcome_of(
     Both start on the path. The tube of e_y is |e_y − ê_y| ≤ L α R + ε with
     R⁺ = α R + |d|_P. `nu_filter` maps (fiber, latent, ν, index) to ν; None for none.
     """
-    model, plant, (run_inputs, envs) = loop.model, loop.plant, run
+    model = loop.model
+    plant = loop.plant
+    (run_inputs, envs) = run
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     rest = jnp.zeros(len(plant.state_names) - 3)
     start = path_state(rest.at[2].set(run_inputs[0, 3]))
@@ -442,7 +449,8 @@ def outcome_of(
 
 def _attack(search: _Search, key: Key, width: float, horizon: int) -> dict[str, Any]:
     """Search for the worst runs, and repeat them with the shield, `width` wide."""
-    loop, bound = search.loop, search.bound
+    loop = search.loop
+    bound = search.bound
     found, outcome = jax.jit(search)(loop.params, key)
 
     def shielded(params: Params, run: Runs) -> Outcome:

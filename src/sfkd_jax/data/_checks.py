@@ -153,7 +153,8 @@ class Checks:
                 refused=False,
             )
             log = log.select(~rows)
-        speed, name = log.states[:, 3], self.columns.state[3]
+        speed = log.states[:, 3]
+        name = self.columns.state[3]
         slow = np.abs(speed) < self.min_speed
         found += _first(
             log,
@@ -184,7 +185,8 @@ class Checks:
         """Time that repeats or goes back."""
 
         def text(k: int) -> str:
-            before, after = log.time[k], log.time[k + 1]
+            before = log.time[k]
+            after = log.time[k + 1]
             if before == after:
                 return f"{self.columns.time} repeats {after:.12g}"
             return f"{self.columns.time} goes back from {before:.12g} to {after:.12g}"
@@ -193,7 +195,9 @@ class Checks:
 
     def _sampling(self, log: Log) -> Iterator[Finding]:
         """Slow sampling, which is refused, gaps and uneven sampling."""
-        waits, period, gaps = log.waits, log.period, log.gaps(self.gap, self.dt)
+        waits = log.waits
+        period = log.period
+        gaps = log.gaps(self.gap, self.dt)
         if period > SLOWER * self.dt:
             yield Finding(
                 f"{log.whole}: recorded every {period:.4g} s, slower than "
@@ -218,7 +222,8 @@ class Checks:
     def _motion(self, log: Log) -> Iterator[Finding]:
         """Stale positions, else rounded ones, else jumps of position and yaw."""
         if (stale := _stale(log)).any():
-            speed, advice = log.states[1:, 3], "; log positions as often as "
+            speed = log.states[1:, 3]
+            advice = "; log positions as often as "
             yield from _first(
                 log,
                 stale,
@@ -236,7 +241,8 @@ class Checks:
         speed, yaw = (log.states[:, k] for k in (3, 2))
         driven = (0.5 * (speed[1:] + speed[:-1]) * log.waits)[log.joined]
         for axis, part in enumerate((np.cos, np.sin)):
-            places, along = log.states[:, axis], driven * part(yaw[1:][log.joined])
+            places = log.states[:, axis]
+            along = driven * part(yaw[1:][log.joined])
             reach = float(np.ptp(np.cumsum(along)))
             # Of a metre, not of the way: a car takes every value of a grid only once.
             count = len(np.unique(np.round(places % 1.0, 6) % 1.0))
@@ -271,7 +277,8 @@ class Checks:
         if not log.joined.any() or _stale(log).any():
             return
         x, y, yaw, speed = self.columns.state[:4]
-        parts, yaws = log.parts(self.gap, self.dt), np.unwrap(log.states[:, 2])
+        parts = log.parts(self.gap, self.dt)
+        yaws = np.unwrap(log.states[:, 2])
 
         def delay(*columns: Float[np.ndarray, "time ..."]) -> Delay:
             table = np.column_stack([log.time, *columns])
@@ -314,7 +321,8 @@ class Checks:
         prior = np.array([1e-9, 1e-9, 16.0 / self.wheelbase**2])
         inverse = np.linalg.inv(weight * causes.T @ causes + np.diag(prior))
         mean = inverse @ (weight * causes.T @ off + prior * 0.5 * self.wheelbase)
-        lag, spread = float(mean[1]), float(np.sqrt(inverse[1, 1]))
+        lag = float(mean[1])
+        spread = float(np.sqrt(inverse[1, 1]))
         alike = np.sqrt(max(0.0, 1.0 - np.mean(rest**2) / max(np.var(off), 1e-12)))
         # Tyres that slip make yaw look early.
         return Delay(lag, float(alike), certain=lag > 5.0 * spread)
@@ -345,8 +353,10 @@ class Checks:
 
     def _units(self, log: Log) -> Iterator[Finding]:
         """The speed against positions, then yaw against the direction of travel."""
-        speed, chords = self.columns.state[3], find_chords(log, log.states[:, 3])
-        moved, integrated = chords.length.sum(), np.abs(chords.integrated).sum()
+        speed = self.columns.state[3]
+        chords = find_chords(log, log.states[:, 3])
+        moved = chords.length.sum()
+        integrated = np.abs(chords.integrated).sum()
         if moved == 0.0 and integrated == 0.0:
             yield warning(f"{log.whole}: neither position nor {speed} ever moves")
         elif moved == 0.0 or integrated == 0.0:

@@ -106,7 +106,8 @@ def split(
             f"got {env_low} and {env_high}"
         )
     # Not "any outside": a NaN is neither inside nor outside.
-    low, high = np.asarray(env_low) - 1e-5, np.asarray(env_high) + 1e-5
+    low = np.asarray(env_low) - 1e-5
+    high = np.asarray(env_high) + 1e-5
     if not np.all((envs >= low) & (envs <= high)):
         raise ValueError(f"environments leave the box [{env_low}, {env_high}]")
     rows = jax.device_get(jax.random.permutation(key, count))
@@ -159,7 +160,8 @@ def pieces(log: Log, dt: float, gap: float) -> Iterator[Piece]:
     the row before (zero order), controls averaged over the step as they were held.
     """
     for rows in log.parts(gap, dt):
-        time, states = log.time[rows] - log.time[rows[0]], log.states[rows]
+        time = log.time[rows] - log.time[rows[0]]
+        states = log.states[rows]
         moments = dt * np.arange(int(time[-1] / dt + SAME_MOMENT) + 1)
         nearest = time[np.searchsorted(0.5 * (time[1:] + time[:-1]), moments)]
         # Rows at these moments are kept exactly.
@@ -231,7 +233,8 @@ def assign_parts(
     random = np.random.default_rng(seed)
     # Fewer runs than parts: one part would be empty in every order.
     for _ in range(ATTEMPTS if len(numbers) >= len(shares) else 0):
-        lacking, owner = np.multiply(shares, len(runs)), np.empty(len(sizes), dtype=int)
+        lacking = np.multiply(shares, len(runs))
+        owner = np.empty(len(sizes), dtype=int)
         # Each run in turn goes to the part that lacks most of its share.
         for run in random.permutation(len(numbers)):
             owner[run] = lacking.argmax()
@@ -333,7 +336,8 @@ def coverage(
     """
     covered = {}
     for name, samples in values.items():
-        low, high = float(samples.min()), float(samples.max())
+        low = float(samples.min())
+        high = float(samples.max())
         middle = np.quantile(samples, [0.001, 0.999]).tolist()
         counts = np.zeros(BINS)
         if high > low:

@@ -222,7 +222,8 @@ def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     if abs(alike) < 0.6:
         return
     fits = float(np.mean(expected**2) / np.mean(expected * turned))
-    name, where = checks.columns.control[0], _span(logs)
+    name = checks.columns.control[0]
+    where = _span(logs)
     if alike < 0:
         yield warning(
             f"{where}: the robot turns against {name}; "
@@ -238,7 +239,8 @@ def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
 
 def _ranges(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     """Controls that hardly vary or leave their limits; environments outside E."""
-    where, columns = _span(logs), checks.columns
+    where = _span(logs)
+    columns = checks.columns
     for k, name in enumerate(columns.control):
         values = np.concatenate([log.controls[:, k] for log in logs])
         kinds = len(np.unique(values))
@@ -258,7 +260,8 @@ def _ranges(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     if low is None and high is None:
         return
     size = logs[0].envs.shape[1]
-    low, high = low or (), high or ()
+    low = low or ()
+    high = high or ()
     if {len(low), len(high)} != {size} or np.any(np.greater(low, high)):
         yield Finding(
             f"environment.low and environment.high must be {size} numbers each, "
@@ -373,7 +376,8 @@ def log_files(path: str) -> list[tuple[str, Path]]:
             "dataset.path is not set: pass dataset.path=FILE, dataset.path=FOLDER or "
             "'dataset.path=GLOB'"
         )
-    here, known = Path(path).expanduser(), ", ".join(SUFFIXES)
+    here = Path(path).expanduser()
+    known = ", ".join(SUFFIXES)
     if here.is_dir():
         absent = f"no {known} in this folder; dataset.path takes globs such as "
         absent += "logs/**/*.csv"

@@ -104,7 +104,8 @@ def generate(
         those of `segment_scenarios`.
     """
     excitation = jnp.asarray([steering_excitation, speed_excitation])
-    low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
+    low = jnp.asarray(vehicle.control_low)
+    high = jnp.asarray(vehicle.control_high)
 
     def one(conditions: Conditions, key: Key) -> Trajectory:
         road_key, speed_key, spread_key, noise_key, start_key, offset_key = (
@@ -225,7 +226,8 @@ def generate_open_loop(
         env_low: lower corner of E.
         env_high: upper corner of E.
     """
-    low, high = jnp.asarray(vehicle.control_low), jnp.asarray(vehicle.control_high)
+    low = jnp.asarray(vehicle.control_low)
+    high = jnp.asarray(vehicle.control_high)
 
     def one(key: Key) -> Trajectory:
         env_key, speed_key, bend_key, spread_key, noise_key = jax.random.split(key, 5)

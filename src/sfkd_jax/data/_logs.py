@@ -96,7 +96,8 @@ class Log:
 
         A copy keeps it, wherever and whenever it begins.
         """
-        yaw, (x, y) = self.states[:-1, 2], np.diff(self.states[:, :2], axis=0).T
+        yaw = self.states[:-1, 2]
+        (x, y) = np.diff(self.states[:, :2], axis=0).T
         ahead = np.cos(yaw) * x + np.sin(yaw) * y
         aside = np.cos(yaw) * y - np.sin(yaw) * x
         turned = np.diff(np.unwrap(self.states[:, 2]))
@@ -194,7 +195,8 @@ def find_chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
     along = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * log.waits)
     along = np.concatenate([[0.0], along])
     chord = log.states[reach:, :2] - log.states[:-reach, :2]
-    length, integrated = np.linalg.norm(chord, axis=1), along[reach:] - along[:-reach]
+    length = np.linalg.norm(chord, axis=1)
+    integrated = along[reach:] - along[:-reach]
     lasted = log.time[reach:] - log.time[:-reach]
     # A chord across a gap or a cut says nothing about the speed.
     whole = lasted < 1.5 * reach * log.period
@@ -205,9 +207,11 @@ def find_chords(log: Log, speed: Float[np.ndarray, " time"]) -> Chords:
         moving |= distance > 0.2 * np.max(distance, where=whole, initial=0.0)
     moving &= whole
     course = np.arctan2(chord[:, 1], chord[:, 0]) + np.pi * (integrated < 0)
-    yaw, first = np.unwrap(log.states[:, 2]), np.flatnonzero(moving)
+    yaw = np.unwrap(log.states[:, 2])
+    first = np.flatnonzero(moving)
     # An odd number of steps has no row in its middle.
-    middle, after = first + reach // 2, first + (reach + 1) // 2
+    middle = first + reach // 2
+    after = first + (reach + 1) // 2
     return Chords(
         length[moving],
         integrated[moving],
@@ -252,7 +256,8 @@ def find_delay(
         held: whether the rate holds from its row on, as a command does.
     """
     lags = np.linspace(-LATEST, LATEST, LAGS)
-    motion, summed = [np.zeros(0)], [np.zeros((LAGS, 0))]
+    motion = [np.zeros(0)]
+    summed = [np.zeros((LAGS, 0))]
     for time, *moved, rate in (table.T for table in tables):
         between = rate[:-1] if held else 0.5 * (rate[1:] + rate[:-1])
         along = np.append(0.0, np.cumsum(between * np.diff(time)))
@@ -265,10 +270,12 @@ def find_delay(
         if chords[1:]:  # a distance has no sign of its own
             chords = [np.sign(summed[-1][LAGS // 2]) * np.hypot(*chords)]
         motion += chords
-    seen, expected = np.concatenate(motion), np.concatenate(summed, axis=1)
+    seen = np.concatenate(motion)
+    expected = np.concatenate(summed, axis=1)
     if (count := len(seen)) < FEWEST:
         return Delay()
-    seen, expected = seen - seen.mean(), expected - expected.mean(axis=1, keepdims=True)
+    seen = seen - seen.mean()
+    expected = expected - expected.mean(axis=1, keepdims=True)
     power = np.sum(expected**2, axis=1)
     if not (seen.any() and power.min() > 0.0):
         return Delay()
@@ -311,7 +318,9 @@ def read_logs(
         conversions of columns to SI units.
     """
     _check_columns(columns, needs_environment)
-    logs, errors, conversions = [], [], []
+    logs = []
+    errors = []
+    conversions = []
     # A file that cannot be read is a finding beside those of the others.
     for file in files:
         try:
@@ -340,7 +349,8 @@ def _check_columns(columns: Columns, needs_environment: bool) -> None:
 
 def _table(file: Path, columns: Columns, dt: float, blanks: bool) -> Table:
     """The columns of a file."""
-    suffix, source = file.suffix.lower(), str(file)
+    suffix = file.suffix.lower()
+    source = str(file)
     wanted = [columns.time, *columns.state, *columns.control, *columns.environment]
     wanted += [columns.run] if columns.run else []
     if suffix == ".csv":
@@ -407,7 +417,8 @@ def _logs(
     table: Table, columns: Columns, needs_environment: bool
 ) -> tuple[list[Log], list[str]]:
     """The runs of a table in SI units, and the conversions."""
-    source, run = table.source, table.run or columns.run
+    source = table.source
+    run = table.run or columns.run
     wanted = {
         "time": (columns.time,),
         "state": columns.state,
@@ -436,7 +447,8 @@ def _logs(
         used = [found[name] for name in names]
         return np.column_stack([table.numbers(one.header, one.factor) for one in used])
 
-    states, size = stacked(columns.state), len(table.rows)
+    states = stacked(columns.state)
+    size = len(table.rows)
     log = Log(
         source=source,
         rows=table.rows,

@@ -51,9 +51,11 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
         trained: the policy, with a shield; also what it exports has its `info`.
         path: of the csv file, which must not exist yet.
     """
-    columns, dt = run_columns(trained), trained.vehicle.dt
+    columns = run_columns(trained)
+    dt = trained.vehicle.dt
     names = [columns.time, *columns.state, *columns.control, *columns.environment]
-    rows, size = count(), len(columns.environment) - len(INPUTS)
+    rows = count()
+    size = len(columns.environment) - len(INPUTS)
     box = in_words(*trained.interface["environment"].values())
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     # A line at a time: what was driven before a crash is kept.
@@ -85,7 +87,8 @@ def recorded_runs(path: str, trained: Any) -> tuple[Trajectory, str]:
         path: a file, a folder or a glob.
         trained: the policy.
     """
-    columns, dt = run_columns(trained), trained.vehicle.dt
+    columns = run_columns(trained)
+    dt = trained.vehicle.dt
     files = log_files(path)
     if len({digest for digest, _ in files}) < len(files):
         raise ValueError(f"{path}: two runs are the same, and count once; remove one")
@@ -100,14 +103,16 @@ def recorded_runs(path: str, trained: Any) -> tuple[Trajectory, str]:
         np.stack([np.asarray(getattr(log, name)[:steps]) for log in logs])
         for name in ("states", "controls", "envs")
     )
-    still, errors = np.zeros((*states.shape[:2], BODY.start)), states[..., -2:]
+    still = np.zeros((*states.shape[:2], BODY.start))
+    errors = states[..., -2:]
     xi = np.concatenate([still, errors, states[..., BODY.start : -2]], axis=-1)
     # What is done in the last row has no outcome.
     env, inputs = np.split(given[:, :-1], [-len(INPUTS)], axis=-1)
     if not env.shape[-1]:  # a policy that reads no e is given zeros
         env = np.zeros((*env.shape[:2], len(trained.settings["space"]["env_mean"])))
     arrays = (jnp.asarray(part, dtype=jnp.float32) for part in (xi, inputs, env))
-    runs, sources = Trajectory(*arrays), [log.source for log in logs]
+    runs = Trajectory(*arrays)
+    sources = [log.source for log in logs]
     return _under_law(runs, controls[:, :-1], trained, sources), fingerprint(path)
 
 
@@ -115,8 +120,10 @@ def _under_law(
     runs: Trajectory, controls: np.ndarray, trained: Any, sources: list[str]
 ) -> Trajectory:
     """Return the runs with the ν that acted, if the law of the policy drove them."""
-    plant, box = trained.vehicle, trained.settings["environment"]
-    low, high = jnp.asarray(box["low"]), jnp.asarray(box["high"])
+    plant = trained.vehicle
+    box = trained.settings["environment"]
+    low = jnp.asarray(box["low"])
+    high = jnp.asarray(box["high"])
 
     def control(xi: PathState, inputs: Control, env: Environment) -> jax.Array:
         return trained.law(xi, inputs[2], inputs[3], jnp.clip(env, low, high))

@@ -90,9 +90,11 @@ class Table(NamedTuple):
             pass
         for row, value in zip(self.rows, values, strict=True):
             if not _is_number(value):
-                text, advice = repr(str(value)[:QUOTED]), ""
+                text = repr(str(value)[:QUOTED])
+                advice = ""
                 if not str(value).strip():
-                    text, advice = "empty", DROP
+                    text = "empty"
+                    advice = DROP
                 raise ValueError(
                     f"{self.source}, {self.row_name} {row}: {name} is {text}, "
                     f"not a number{advice}"
@@ -287,7 +289,8 @@ def find_column(
     configured name that holds the unit itself is converted if the unit is known. It
     must be of the dimension, of `DIMENSIONS`, unless that is None.
     """
-    exact, fitting = name in headers, [name]
+    exact = name in headers
+    fitting = [name]
     if not exact:
         fitting = [one for one in headers if split_unit(one)[0] == name != one.strip()]
     if len(fitting) > 1:

@@ -235,12 +235,14 @@ def open_loop(
     windows = adjacent_windows(trajectories, length=horizon)
 
     def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
-        predicted, true = rollout(model, params, window).free, window.states[1:]
+        predicted = rollout(model, params, window).free
+        true = window.states[1:]
         if not model.along_path:
             return state_errors(predicted, true)[:, :4] ** 2
         gap = (predicted - true)[:, BODY]
         # Along a path nothing is predicted of the way along it.
-        still, yaw = jnp.zeros(gap.shape[0]), wrap_angle(gap[:, HEADING])
+        still = jnp.zeros(gap.shape[0])
+        yaw = wrap_angle(gap[:, HEADING])
         return jnp.column_stack([still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]) ** 2
 
     return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))

@@ -146,7 +146,8 @@ def _spread(values: Float[np.ndarray, "*seed episode"]) -> Spread | None:
         freedom = table.size - 1
         return Spread(mean, error, float(episodes == 1), (freedom, freedom))
     freedom = trainings - 1, episodes - 1
-    by_training, by_episode = table.mean(axis=1), table.mean(axis=0)
+    by_training = table.mean(axis=1)
+    by_episode = table.mean(axis=0)
     rest = table - by_training[:, None] - by_episode + table.mean()
     of_trainings = episodes * np.var(by_training, ddof=1)
     of_episodes = trainings * np.var(by_episode, ddof=1)

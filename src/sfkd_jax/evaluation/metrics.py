@@ -138,7 +138,8 @@ def _nearest(run: Recording) -> np.ndarray:
 
 def _below_claim(run: Recording) -> np.ndarray:
     """Number of steps nearer to an obstacle than was claimed; NaN without a claim."""
-    gap, claim = run.signals["gap"], run.signals["clearance"]
+    gap = run.signals["gap"]
+    claim = run.signals["clearance"]
     below = np.sum(gap < claim, axis=1)
     return np.where(np.all(np.isnan(claim), axis=1), np.nan, below)
 

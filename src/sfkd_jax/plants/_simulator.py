@@ -77,7 +77,8 @@ class _Worker:
     """One process; it is started when it is needed, and again when it is lost."""
 
     def __init__(self, make: Make) -> None:
-        self._make, self._patience = make, PATIENCE
+        self._make = make
+        self._patience = PATIENCE
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> dict[str, Any]:
@@ -100,7 +101,8 @@ class _Worker:
         about, faults = self._answer(PATIENCE)
         if faults:
             raise ValueError(f"vehicle.env={self._make}: {faults[0]}")
-        self._patience, self._size = about.pop("timeout_s"), len(about["state_names"])
+        self._patience = about.pop("timeout_s")
+        self._size = len(about["state_names"])
         return about
 
     def send(self, what: Any) -> None:
@@ -145,8 +147,10 @@ class _Environment:
     """A gymnasium environment as a simulator; its observation is the state."""
 
     def __init__(self, env: Any) -> None:
-        self._env, limits = env, env.action_space
-        self.control_low, self.control_high = limits.low, limits.high
+        self._env = env
+        limits = env.action_space
+        self.control_low = limits.low
+        self.control_high = limits.high
 
     def __getattr__(self, name: str) -> Any:
         """What describes the vehicle is below the wrappers of gymnasium."""
@@ -195,7 +199,8 @@ def _serve(channel: Connection) -> None:
     channel.send((about, []))
     size = len(about["state_names"])
     while True:
-        rows, faults = channel.recv(), []
+        rows = channel.recv()
+        faults = []
         states = np.full((len(rows), size), np.nan)
         for index, row in enumerate(rows):
             try:

@@ -84,12 +84,16 @@ def kinematic(
     bicycle = nominal_derivative(length, rear_length)
 
     def derivative(state: State, control: Control, env: Environment) -> State:
-        yaw, speed = state[2], state[3]
-        steering, acceleration = control[0], control[1]
-        friction, wind = env[0], env[1]
+        yaw = state[2]
+        speed = state[3]
+        steering = control[0]
+        acceleration = control[1]
+        friction = env[0]
+        wind = env[1]
         # At μ = 1 the stiffnesses are those given: friction then only limits forces.
         grip = friction if stiffness_by_friction else 1.0
-        front, rear = front_stiffness * grip, rear_stiffness * grip
+        front = front_stiffness * grip
+        rear = rear_stiffness * grip
         force = side_force(wind, wind_force=wind_force)
         understeer = mass / length * (rear_length / front - front_length / rear)
         push = (
@@ -109,7 +113,8 @@ def kinematic(
             - (front_length - wind_lever) * force
         ) / length
         slip = rear_length * curvature - rear_force / rear
-        x, y = speed * jnp.cos(yaw + slip), speed * jnp.sin(yaw + slip)
+        x = speed * jnp.cos(yaw + slip)
+        y = speed * jnp.sin(yaw + slip)
         slowed = resistance(speed, mass=mass, drag=drag, rolling=rolling)
         return jnp.stack([x, y, speed * curvature, scale * acceleration - slowed])
 
@@ -208,7 +213,8 @@ def dynamic(
         # In the order of `state_names` below.
         yaw, speed, side_speed, yaw_rate, steering = (state[k] for k in range(2, 7))
         grip = env[0] * GRAVITY
-        cos, sin = jnp.cos(steering), jnp.sin(steering)
+        cos = jnp.cos(steering)
+        sin = jnp.sin(steering)
         drive = _acceleration(control, speed, grip)
         # Load moves to the front under braking, which turns a sliding car in.
         front_mass = mass * (rear_length - height * drive / GRAVITY) / length

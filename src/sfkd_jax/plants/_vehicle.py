@@ -96,12 +96,14 @@ def nominal_derivative(length: float, rear_length: float, *, states: int = 4) ->
     """
 
     def derivative(state: State, control: Control, env: Environment) -> State:
-        yaw, speed = state[2], state[3]
+        yaw = state[2]
+        speed = state[3]
         # Without slip both wheels turn about one centre: κ = tan δ / L.
         curvature = jnp.tan(control[0]) / length
         # β ≈ l_r κ for small angles: the centre of mass moves at this angle to the car.
         course = yaw + rear_length * curvature
-        x, y = speed * jnp.cos(course), speed * jnp.sin(course)
+        x = speed * jnp.cos(course)
+        y = speed * jnp.sin(course)
         moved = jnp.stack([x, y, speed * curvature, control[1]])
         return jnp.concatenate([moved, jnp.zeros(states - 4)])
 
@@ -153,7 +155,8 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
             "of speed commands: speed_loop=true"
         )
     # Limits of the acceleration, before the entries become those of a speed.
-    low, high = vehicle.control_low[1], vehicle.control_high[1]
+    low = vehicle.control_low[1]
+    high = vehicle.control_high[1]
 
     def close(step: Step) -> Step:
         def closed(state: State, control: Control, env: Environment) -> State:

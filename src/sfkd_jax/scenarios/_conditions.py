@@ -54,7 +54,8 @@ def wet_road(
         drop_time: range of its time [s].
     """
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
-    high, low = within(before, before_key), within(after, after_key)
+    high = within(before, before_key)
+    low = within(after, after_key)
     # A hair early: k dt may round to just below the time of the drop.
     dry = jnp.arange(steps) * dt < within(drop_time, time_key) - 1e-6
     wind = gusts(gust_key, steps=steps, dt=dt, peak=PEAK_WIND)
@@ -95,7 +96,8 @@ def in_box(envs: Schedule, low: Corner, high: Corner) -> Float[Array, "time env"
         return envs
     grip = (envs[:, :1] - BOX[0][0]) / (BOX[1][0] - BOX[0][0])
     wind = jnp.repeat(envs[:, 1:] / PEAK_WIND, len(low) - 1, axis=1)
-    bottom, top = jnp.asarray(low), jnp.asarray(high)
+    bottom = jnp.asarray(low)
+    top = jnp.asarray(high)
     sided = (bottom < 0.0) & (top > 0.0)
     from_zero = jnp.where(wind < 0.0, -wind * bottom[1:], wind * top[1:])
     from_end = bottom[1:] + jnp.abs(wind) * (top - bottom)[1:]
@@ -199,5 +201,6 @@ def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment
     """A point of a box; each entry is at an end of its range with probability 1/3."""
     # A wider range, clipped: the ends, where models are worst, are drawn often.
     share = jnp.clip(within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
-    bottom, top = jnp.asarray(low), jnp.asarray(high)
+    bottom = jnp.asarray(low)
+    top = jnp.asarray(high)
     return bottom + share * (top - bottom)

@@ -97,7 +97,8 @@ def _wanted_speeds(
         key, 6
     )
     low, high = limits.speed
-    time, legs = jnp.arange(steps) * dt, int(steps * dt / LEG[0]) + 2
+    time = jnp.arange(steps) * dt
+    legs = int(steps * dt / LEG[0]) + 2
     leg = jnp.searchsorted(jnp.cumsum(within(LEG, leg_key, legs)), time)
     # A quarter beyond the range, then clipped: its ends are reached and held.
     beyond = 0.25 * (high - low)

@@ -171,7 +171,8 @@ def scenario(
     if name not in ROADS:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
     # round: duration / dt may fall just below the whole number of steps.
-    road, steps = ROADS[name], round(duration / dt)
+    road = ROADS[name]
+    steps = round(duration / dt)
     # Longer than the distance by a tenth and a horizon: no plan meets its end.
     length = speed * duration * 1.1 + 50.0
 
@@ -203,7 +204,8 @@ def family(
         # A key each: other conditions leave the path of an episode as it is.
         path_key, condition_key = jax.random.split(key)
         start = jnp.zeros(state_size).at[3].set(speed)
-        envs, path = conditions(condition_key), paths(path_key)
+        envs = conditions(condition_key)
+        path = paths(path_key)
         course = courses and courses(course_key, path)
         # The controller observes the truth; a measurement error replaces this field.
         return Scenario(start, envs, envs, path, jnp.asarray(speed), course)
