@@ -102,7 +102,7 @@ def test_what_the_caller_asked_for_is_not_blamed_on_the_file(options, message):
 )
 def test_strict_numerics_of_the_caller_reach_no_policy(setting, value, caplog):
     """Nor are there more programs than weights, explicit weights, limits and state."""
-    policy._build.cache_clear()
+    policy._trained._built_from_json.cache_clear()
     inputs = start("kinematic"), ENV, straight(20)
     with getattr(jax, setting)(value), jax.log_compiles():
         trained = policy.load(demo.SHIPPED / "kinematic_path")

@@ -1,0 +1,326 @@
+"""Load trained controllers, without Hydra, orbax, convex solvers or matplotlib."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial, wraps
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sfkd_jax import build, store
+from sfkd_jax.control import behind, requesting
+from sfkd_jax.geometry import relative, shifted
+from sfkd_jax.policy._description import FRICTION_AND_WIND as FRICTION_AND_WIND
+from sfkd_jax.policy._description import describe, interface_of
+from sfkd_jax.policy._trained import KIND as KIND
+from sfkd_jax.policy._trained import LAW as LAW
+from sfkd_jax.policy._trained import TrainedModel as TrainedModel
+from sfkd_jax.policy._trained import built as built
+from sfkd_jax.policy._trained import policy_file, policy_numerics
+from sfkd_jax.policy._trained import restore as restore
+from sfkd_jax.policy._trained import save as save
+from sfkd_jax.rollout import fold, on_host, unfold
+from sfkd_jax.settings import Values
+from sfkd_jax.types import Controller, Key, Params
+
+CERTIFICATE = "certificate.json"
+"""The certificate in a run directory."""
+RECORDED = "certificate.runs.json"
+"""The certificate with the corridor of recorded runs; it is read in place of the other
+where both exist.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Policy(TrainedModel):
+    """A trained controller, as `load` returns it; `params` are folded for it.
+
+    Attributes:
+        controller: `Controller(init, act)`, pure; jit, vmap or scan it.
+        certificate: the verified document of certificate.json, or None if it is
+            missing, refused or stale.
+        around: (planner=another along a path) -> controller, see
+            `build.build_controller`.
+    """
+
+    controller: Controller
+    certificate: dict[str, Any] | None
+    around: Callable[..., Controller]
+
+    @property
+    def interface(self) -> dict[str, Any]:
+        """Names, units and limits of controls, observation, e and reference."""
+        return interface_of(self, self.certificate)
+
+    def __repr__(self) -> str:
+        """Say what it drives, where its certificate applies, and what is proved."""
+        return describe(self, self.certificate)
+
+    def _with_corridor(self) -> dict[str, Any]:
+        """Return the certificate, or raise a ValueError if it has no corridor."""
+        if not (self.certificate and self.certificate.get("corridor")):
+            raise ValueError(
+                "this policy has no certified corridor to keep a planner in: load one "
+                "in path coordinates with its certificate, as pretrained/dynamic_path"
+            )
+        return self.certificate
+
+    def guard(self, planner: Controller, *, along_path: bool = False) -> Controller:
+        """Return any planner behind the shield of this policy, to be called like it.
+
+        Args:
+            planner: its `act` receives the params of the policy (bind others with
+                `partial`), the observation, e and the reference, and returns a control
+                of the vehicle. Entries of its `info` appear in that of the guard.
+            along_path: whether it takes ξ and a preview instead of observation and
+                reference, see `control.along_reference`.
+
+        Raises:
+            ValueError: the policy has no certified corridor.
+        """
+        self._with_corridor()
+        # Its settings are numbers, also where a program is traced when it is built.
+        with jax.ensure_compile_time_eval():
+            if along_path:
+                return _entrance(self.around(planner=planner), self)
+            horizon = build.controller_horizon(self.settings["controller"])
+            coordinates = len(self.vehicle.state_names) - 1
+            shielded = self.around(planner=requesting(planner, horizon, coordinates))
+        return _entrance(behind(shielded), self)
+
+    def in_lane(
+        self, *, car: tuple[float, float] = (4.5, 2.0), planner: str = "mppi"
+    ) -> Controller:
+        """Return a controller that drives in a lane, round obstacles, see `InLane`.
+
+        Its `act` takes (`Lane`, `Obstacles`) in place of the reference.
+
+        Args:
+            car: length and width [m]; its middle is the observed position.
+            planner: name of the planner that searches for a reference, "mppi" or "cem".
+
+        Raises:
+            ValueError: the policy has no certified corridor.
+        """
+        certificate = self._with_corridor()
+        law = self.law
+        # A corridor is about path coordinates, and these about a law.
+        assert law is not None
+        names = self.interface["environment"]["names"]
+        friction = [i for i, name in enumerate(names) if name.startswith("friction")]
+        with jax.ensure_compile_time_eval():
+            controller = build.build_in_lane(
+                self.controller,
+                self.vehicle,
+                law,
+                certificate,
+                horizon=self.interface["horizon"],
+                car=car,
+                planner=planner,
+                friction=friction[0] if friction else None,
+            )
+        return _in_policy_numerics(controller)
+
+    def __reduce__(self) -> Any:
+        """Refuse to be pickled; functions of a closure say less clearly why."""
+        raise TypeError("a Policy cannot be pickled: sfkd_jax.load it in that process")
+
+    @property
+    def weights(self) -> Params:
+        """The learned parameters as they were saved, to train on or to save again."""
+        return unfold(self.params)
+
+
+@policy_numerics()
+def load(
+    path: str | Path,
+    *,
+    controller: Mapping[str, Any] | None = None,
+    env_source: str = "measured",
+    adaptive: bool = False,
+) -> Policy:
+    """Return the policy in a run directory, with its certificate verified.
+
+    Without a certificate it warns and gives the reason.
+
+    Args:
+        path: path of the directory, or of a policy.safetensors.
+        controller: settings of a controller to build instead of the saved one.
+        env_source: one of `build.ENV_SOURCES`. "estimated" for a policy in path
+            coordinates that estimates the environment and ignores the one it is given;
+            "none" for a policy that reads none.
+        adaptive: whether a policy in path coordinates estimates unmeasured forces and
+            errors of its inputs while driving, see `control.Adaptation`.
+
+    Raises:
+        ArtefactError: as `restore`, or a certificate that does not hold.
+        ValueError: `controller` or `env_source` does not fit the policy, or an estimate
+            is asked of a policy that is not in path coordinates.
+    """
+    file = policy_file(path)
+    trained = restore(path)
+    # Here, so that a certificate is checked on the weights that will be multiplied.
+    trained = replace(trained, params=fold(trained.model, trained.params, on_host))
+    certificate, reason = read_certificate(path, trained)
+    with store.as_artefact_error(file):
+        reads_env = trained.settings["model"].get("environment", True)
+        settings = _driving_settings(trained.settings, controller, env_source)
+        shielded = settings["controller"].get("shield")
+    # Never the same planner without its shield, unless the caller says so.
+    if shielded and not (certificate or {}).get("corridor"):
+        raise store.ArtefactError(
+            f"{file}: controller.shield needs a certified corridor, and "
+            f"{reason or 'the certificate has none'}; run certify, or load it with "
+            "controller=... and shield=False"
+        )
+    _check_env_source(env_source, reads_env)
+    # Errors are about the file, unless the caller asked for something else.
+    as_saved = controller is None and env_source == "measured" and not adaptive
+    errors: AbstractContextManager[None] = nullcontext()
+    if as_saved:
+        errors = store.as_artefact_error(file, ValueError)
+    with errors:
+        around = partial(
+            build.build_controller,
+            settings["controller"],
+            trained.model,
+            trained.vehicle,
+            env_low=settings["environment"]["low"],
+            env_high=settings["environment"]["high"],
+            env_source=env_source,
+            certificate=certificate,
+            law=trained.law,
+            adaptive=adaptive,
+        )
+        planner = around()
+    if certificate is None:
+        # 3: `policy_numerics` stands between this function and its caller.
+        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
+    return Policy(
+        **vars(replace(trained, settings=settings)),
+        controller=_entrance(planner, trained),
+        certificate=certificate,
+        around=around,
+    )
+
+
+def _driving_settings(
+    saved: Values, controller: Mapping[str, Any] | None, env_source: str
+) -> dict[str, Any]:
+    """Return the saved settings with the controller and the source of e to drive with.
+
+    Args:
+        saved: the settings in the file of the policy.
+        controller: settings of a controller in place of the saved one, or None.
+        env_source: one of `build.ENV_SOURCES`.
+    """
+    return {
+        **saved,
+        "environment": {**saved["environment"], "source": env_source},
+        "controller": controller or saved["controller"],
+    }
+
+
+def _check_env_source(env_source: str, reads_env: bool) -> None:
+    """Raise a ValueError unless a policy can take its environment from this source.
+
+    What a model reads must come from somewhere; what it does not is not estimated.
+    """
+    impossible = "none" if reads_env else "estimated"
+    sources = [source for source in build.ENV_SOURCES if source != impossible]
+    if env_source not in sources:
+        raise ValueError(
+            f"env_source must be {' or '.join(sources)} for a policy that "
+            f"{'reads' if reads_env else 'ignores'} the environment, got {env_source!r}"
+        )
+
+
+def _in_policy_numerics(controller: Controller) -> Controller:
+    """Return the same controller, which sets the numerics of a policy for itself."""
+    return Controller(
+        init=policy_numerics()(controller.init),
+        act=policy_numerics()(controller.act),
+    )
+
+
+def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
+    """Return the same controller, with `policy_numerics` and a check of its arguments.
+
+    Positions in double precision are made relative before anything is float32.
+    """
+    names = trained.vehicle.state_names
+    shape = (len(names),)
+    env_shape = (len(trained.settings["space"]["env_mean"]),)
+    # One program, where every array of the state would otherwise be one.
+    compiled = jax.jit(controller.init)
+
+    @wraps(controller.init)
+    def init(key: Key) -> Any:
+        if trained.model.along_path and jax.debug_nans.value:
+            raise ValueError(
+                "jax_debug_nans: controllers along a path keep NaN for what is not "
+                "known yet; switch it off"
+            )
+        return compiled(key)
+
+    @wraps(controller.act)
+    def act(
+        params: Params, state: Any, observation: Any, env: Any, reference: Any
+    ) -> Any:
+        # Broadcasting would accept some, and others fail far from here.
+        if jnp.shape(observation) != shape:
+            raise ValueError(
+                f"observation must have shape {shape}: {', '.join(names)}; "
+                f"got {jnp.shape(observation)}"
+            )
+        if jnp.shape(env) != env_shape:
+            raise ValueError(f"env must have shape {env_shape}, got {jnp.shape(env)}")
+        near, ahead, origin = relative(observation, reference)
+        moved = near is not observation
+        control, state, info = controller.act(
+            params, state, jnp.asarray(near), env, jnp.asarray(ahead)
+        )
+        if moved:
+            # What is reported is in the world again, on the host in float64.
+            states = shifted(info["predicted_states"], origin)
+            info = {**info, "predicted_states": states}
+        return control, state, info
+
+    return _in_policy_numerics(Controller(init, act))
+
+
+def read_certificate(
+    path: str | Path, trained: TrainedModel
+) -> tuple[dict[str, Any] | None, str]:
+    """Verify the certificate beside a policy, in its run directory.
+
+    Returns:
+        The certificate and "", or None and the reason why there is none.
+
+    Raises:
+        ArtefactError: it is damaged, or does not follow from its witnesses.
+    """
+    from sfkd_jax import certification  # loaded only if there is something to verify
+
+    files = [policy_file(path).with_name(name) for name in (RECORDED, CERTIFICATE)]
+    file = next((file for file in files if file.exists()), None)
+    if file is None:
+        return None, f"{CERTIFICATE} is missing"
+    document = store.read_json(file, keys=("valid",))
+    if document["valid"] is not True:
+        reason = store.one_line(document.get("reason"))
+        return None, f"the certificate was refused: {reason}"
+    try:
+        with store.as_artefact_error(file):
+            certification.verify_document(document, trained)
+    except certification.CertificateStale as reason:
+        return None, f"{reason}; certify again"
+    except certification.CertificationRefused as reason:
+        raise store.ArtefactError(f"{file}: {reason}") from None
+    return document, ""

@@ -1,0 +1,134 @@
+"""What a policy says about itself: its inputs and outputs, and its printed text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from sfkd_jax import build
+from sfkd_jax.policy._trained import TrainedModel
+from sfkd_jax.ranges import in_words
+
+UNITS = {
+    "p_x": "[m]",
+    "p_y": "[m]",
+    "yaw": "[rad]",
+    "v": "[m/s]",
+    "v_y": "[m/s]",
+    "yaw_rate": "[rad/s]",
+    "steering": "[rad]",
+}
+"""Units of the states of the vehicles of this package."""
+FRICTION_AND_WIND = ["friction [-]", "lateral wind [m/s]"]
+"""Names of the entries of e, unless the settings or the certificate name others."""
+
+
+def interface_of(
+    trained: TrainedModel, certificate: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Return names, units and limits of controls, observation, e and reference."""
+    vehicle = trained.vehicle
+    environment = trained.settings["environment"]
+    # With a speed loop the second control is the speed that the loop is given.
+    second = "speed command [m/s]" if vehicle.speed_loop else "acceleration [m/s^2]"
+    names = ("steering [rad]", second)
+    limits = zip(names, vehicle.control_low, vehicle.control_high, strict=True)
+    # An environment that was measured in logs has names of its own.
+    boxes = (certificate or {}).get("boxes", {})
+    columns = boxes.get("names", {}).get("env")
+    return {
+        "sampling_period_s": vehicle.dt,
+        "horizon": build.controller_horizon(trained.settings["controller"]),
+        "controls": [
+            {"name": name, "low": low, "high": high} for name, low, high in limits
+        ],
+        "observation": list(vehicle.state_names),
+        "environment": {
+            "names": columns or environment.get("names") or FRICTION_AND_WIND,
+            "low": list(environment["low"]),
+            "high": list(environment["high"]),
+        },
+        "reference": ["x [m]", "y [m]", "yaw [rad]", "speed [m/s]"],
+    }
+
+
+def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
+    """Return what a policy drives, where its certificate applies, what is proved."""
+    vehicle = trained.vehicle
+    interface = interface_of(trained, certificate)
+    frame = "along a path" if trained.model.along_path else "in the world"
+    states = [f"{name} {UNITS.get(name, '')}".strip() for name in vehicle.state_names]
+    controls = in_words(
+        [control["name"] for control in interface["controls"]],
+        [control["low"] for control in interface["controls"]],
+        [control["high"] for control in interface["controls"]],
+    )
+    source = trained.settings["environment"]["source"]
+    box = interface["environment"]
+    lines = [
+        f"Policy of {vehicle.name} {frame}, a step of {vehicle.dt:g} s",
+        f"states: {', '.join(states)}",
+        f"controls: {controls}",
+        f"environment, {source}: {in_words(box['names'], box['low'], box['high'])}",
+    ]
+    if certificate:
+        body = states[3:]
+        lines.append(_certified_box(certificate, body, trained.model.along_path))
+        lines.extend(_certified_facts(certificate, box["names"]))
+    else:
+        lines.append("no certificate: nothing is proved, nothing measured")
+    return "\n  ".join(lines)
+
+
+def _certified_box(document: dict[str, Any], body: list[str], along_path: bool) -> str:
+    """Return the line about the states for which the certificate is stated.
+
+    Args:
+        document: the certificate.
+        body: names of the body state.
+        along_path: whether the states are path coordinates.
+    """
+    boxes = document["boxes"]
+    low, high = boxes["state"]
+    if not along_path:
+        return f"certified box: {in_words(body, low, high)}"
+    names = ["e_y [m]", "e_psi [rad]", *body, "curvature [1/m]", "v_ref [m/s]"]
+    # The first two inputs are ν, which is the planner's choice and has no condition.
+    inputs_low, inputs_high = boxes["control"]
+    limits_low = [*low, *inputs_low[2:]]
+    limits_high = [*high, *inputs_high[2:]]
+    return f"certified box: {in_words(names, limits_low, limits_high)}"
+
+
+def _certified_facts(document: dict[str, Any], env_names: list[str]) -> Iterator[str]:
+    """Yield the lines about what is proved and what is only measured."""
+    yield f"proved: alpha {document['alpha']:.4f}, contraction of the model a step"
+    d_bar = document.get("d_bar") or {"value": float("nan")}
+    measured = f"measured, not signed: d_bar {d_bar['value']:.3g}"
+    corridor = document.get("corridor")
+    if not corridor:
+        yield f"{measured}; no corridor"
+        return
+    width = f"{corridor['corridor_m']:.3f} m to each side"
+    kept = f"{100 * corridor['coverage']:.1f} % of {corridor['coverage_runs']} runs"
+    yield f"{measured}, corridor {width}, kept in {kept}"
+    yield _corridor_conditions(corridor["conditions"], env_names)
+    if recorded := document.get("recorded"):
+        number = recorded["conditions"]["runs"]
+        width = f"{recorded['corridor_m']:.3f} m"
+        yield f"of {number} runs of the car: {width} at level {recorded['level']:g}"
+    elif not build.is_claimed(document):
+        yield "of a model of logs, not of the car, about which nothing is claimed"
+
+
+def _corridor_conditions(conditions: dict[str, Any], env_names: list[str]) -> str:
+    """Return the line about the runs on which the corridor was measured."""
+    slowest, fastest = conditions["speed"]
+    env_low, env_high = conditions["env_box"]
+    box = in_words(
+        ["speed [m/s]", *env_names], [slowest, *env_low], [fastest, *env_high]
+    )
+    shortest, longest = conditions["dwell_s"]
+    dwell = f"{shortest:g} to {longest:g} s"
+    bend = conditions["peak_curvature"]
+    return f"under: {box}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"

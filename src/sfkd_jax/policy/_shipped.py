@@ -1,0 +1,63 @@
+"""The policies that ship with the package, by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from sfkd_jax import store
+
+SHIPPED = Path(__file__).parents[1] / "pretrained"
+"""A folder for each shipped policy, as `train` wrote it."""
+
+
+class ShippedPolicy(NamedTuple):
+    """What a shipped policy drives, read from its certificate.
+
+    `sfkd_jax.load` verifies the certificate; this summary does not.
+
+    Attributes:
+        vehicle: name of the simulated vehicle.
+        frame: "path" for path coordinates, "body" for the frame of the body, in which
+            nothing is known about the distance from a path.
+        corridor_m: half width of the calibrated corridor [m].
+        speed: lowest and highest speed of the class [m/s].
+        peak_curvature: largest curvature of the roads of the class [1/m].
+        env_low: lowest friction [-] and side wind [m/s].
+        env_high: highest friction [-] and side wind [m/s].
+    """
+
+    vehicle: str
+    frame: str
+    corridor_m: float | None
+    speed: tuple[float, float] | None
+    peak_curvature: float | None
+    env_low: tuple[float, ...]
+    env_high: tuple[float, ...]
+
+
+def policies() -> dict[str, ShippedPolicy]:
+    """Return the policies that ship with the package, by the names that `load` takes."""
+    return {name: _summary(SHIPPED / name) for name in shipped_names()}
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the policies that ship with the package."""
+    return sorted(file.parent.name for file in SHIPPED.glob(f"*/policy{store.SUFFIX}"))
+
+
+def _summary(folder: Path) -> ShippedPolicy:
+    """Read the summary of one policy from its certificate."""
+    document = store.read_json(folder / "certificate.json", keys=("boxes",))
+    env_low, env_high = document["boxes"]["env"]
+    corridor = document.get("corridor")
+    conditions = corridor["conditions"] if corridor else {}
+    return ShippedPolicy(
+        vehicle=folder.name.split("_")[0],
+        frame="path" if corridor else "body",
+        corridor_m=corridor["corridor_m"] if corridor else None,
+        speed=tuple(conditions["speed"]) if conditions else None,
+        peak_curvature=conditions.get("peak_curvature"),
+        env_low=tuple(round(end, 6) for end in env_low),
+        env_high=tuple(round(end, 6) for end in env_high),
+    )
