@@ -18,7 +18,9 @@ from sfkd_jax.experiment import data, identified, runs, stages
 from sfkd_jax.store import ArtefactError
 
 sys.path.append(str(Path(__file__).parent / "data"))
-from recorded import NAMES, drive_by_hand, drive_under, recorded_run, write_csv
+sys.path.append(str(Path(__file__).parents[1] / "examples"))
+from recorded import NAMES, recorded_run, write_csv
+from recording import drive_by_hand, drive_under
 
 STATE = "dataset.columns.state=[p_x,p_y,yaw,v,yaw_rate]"
 SMALL = (

@@ -1,4 +1,4 @@
-"""Simulators that are not written in JAX: one with every fault, and highway-env's car.
+"""A simulator that is not written in JAX and has every fault.
 
 In a file of their own, which workers import.
 """
@@ -66,37 +66,3 @@ class Gym(gymnasium.Env):
 
 def wrapped():
     return gymnasium.wrappers.TimeLimit(Gym(), max_episode_steps=1)
-
-
-def highway():
-    """The dynamic bicycle of highway-env; e = (grip [-], side force [kN])."""
-    from highway_env.vehicle.dynamics import BicycleVehicle
-
-    class Bicycle(BicycleVehicle):
-        push = 0.0
-
-        def derivative_func(self, *given, **more):
-            rates = super().derivative_func(*given, **more)
-            rates[4] += self.push
-            return rates
-
-    class Highway:
-        state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
-        environment_names = ("grip [-]", "side force [kN]")
-        dt, wheelbase = 0.1, Bicycle.LENGTH
-        control_low, control_high = (-0.5, -6.0), (0.5, 3.0)
-
-        def reset(self, state):
-            self.car = Bicycle(None, state[:2], state[2], state[3])
-            self.car.lateral_speed, self.car.yaw_rate = state[4:]
-
-        def step(self, control, environment):
-            car = self.car
-            car.FRICTION_FRONT = car.FRICTION_REAR = 15.0 * environment[0]
-            car.push = environment[1] / 1.5  # on 1.5 t
-            car.act({"steering": control[0], "acceleration": control[1]})
-            for _ in range(2):
-                car.step(0.05)
-            return car.state[:, 0]
-
-    return Highway()

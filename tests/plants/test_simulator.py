@@ -3,6 +3,7 @@ and what they do wrong ends one run alone.
 """
 
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from sfkd_jax.experiment import data, evaluating
 from tests.plants import simulators
 
 HERE = "tests.plants.simulators"
+EXAMPLES = str(Path(__file__).parents[2] / "examples")
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +101,11 @@ def test_a_simulator_that_cannot_be_made_is_refused_in_one_line(make, reason):
     assert "\n" not in str(refusal.value)
 
 
-def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path):
+def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path, monkeypatch):
     """Recorded, and evaluated in S3 at the levels of its own box of e."""
-    pytest.importorskip("highway_env")
-    words = f"""+experiment=s3_body vehicle=simulator vehicle.env={HERE}:highway
+    monkeypatch.syspath_prepend(EXAMPLES)
+    highway = pytest.importorskip("highway")
+    words = f"""+experiment=s3_body vehicle=simulator vehicle.env=highway:make
         environment.low=[0.35,-3] environment.high=[1,3] dataset.segments=20
         dataset.steps=10 dataset.shares=[0.25,0.25,0.25,0.25] root={tmp_path}
         evaluation.systems=[nominal] evaluation.episodes=2 evaluation.episode_s=3
@@ -113,7 +116,7 @@ def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path):
     noise = chosen.sensors(("yaw_rate", "p_x", "load"))
     assert noise == (0.002, 0.015, 0.0)  # by name, in any order
     runs = data.ensure_dataset(chosen)[0].train
-    car = simulators.highway()
+    car = highway.make()
     for state, control, env, after in zip(
         runs.states[0], runs.controls[0], runs.envs[0], runs.states[0, 1:], strict=False
     ):
