@@ -99,7 +99,8 @@ def line(system: str, name: str | None = None) -> dict[str, Any]:
         "color": look.colour,
         "linestyle": (0, look.dashes) if look.dashes else "-",
         "linewidth": look.width,
-        "zorder": {"sfkd": 5, "oracle": 4}.get(family(system), 3),
+        # The oracle above SFKD: its dashes let the line below be seen.
+        "zorder": {"oracle": 5, "sfkd": 4}.get(family(system), 3),
     }
 
 
@@ -110,13 +111,16 @@ def canvas(height: float) -> Figure:
     return figure
 
 
-def legend(figure: Figure, axes: Any) -> None:
+def legend(figure: Figure, axes: Any, title: str | None = None) -> None:
     """Put one legend above the whole figure, which grows by the rows of the legend."""
     handles, labels = axes.get_legend_handles_labels()
     # Long names take the room of a column.
     columns = 3 if any(len(one) > 20 for one in labels) else 4
     columns = min(columns, max(1, len(labels)))
-    figure.legend(handles, labels, loc="outside upper left", ncols=columns)
+    where = "outside upper left"
+    figure.legend(
+        handles, labels, loc=where, ncols=columns, title=title, alignment="left"
+    )
     figure.set_figheight(figure.get_figheight() + 0.2 * ((len(labels) - 1) // columns))
 
 
