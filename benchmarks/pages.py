@@ -335,4 +335,3 @@ def written():
 if __name__ == "__main__":
     for path, text in written().items():
         path.write_text(text, "utf-8")
-    results.draw_figure2()

@@ -1,7 +1,9 @@
 """Results in the repository: one JSON a benchmark, one line a row, and the tables of docs/results.md.
 
     python -m experiments.results benchmark [RUN]    takes runs/RUN/results.json; bench3 adds its rows
+    python -m experiments.results figure1 [RUN]      keeps one episode of runs/RUN, by default table1
     python -m benchmarks.pages                       writes the tables
+    python -m experiments.paper_figures              draws the figures
 
 A row keeps the lateral RMSE of every episode of every training, from which intervals are
 computed here; Holm's correction needs the whole comparison and was made by `compare`.
@@ -18,12 +20,14 @@ import numpy as np
 import yaml
 
 from benchmarks import write
+from experiments import paper_figures
 from sfkd_jax import evaluation
-from sfkd_jax.report import figures, style
+from sfkd_jax.report import style
 
 HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
 BENCHMARKS = ("benchmark", "table1", "figure2", "corridor")
+FIGURE1 = "figure1"
 CARS = "kinematic", "kinematic_stiff", "dynamic"
 VEHICLES = dict(zip(CARS, ("kinematic", "stiff kinematic", "dynamic"), strict=True))
 LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
@@ -224,24 +228,6 @@ def paper_table():
     return markdown(heads, lines)
 
 
-def draw_figure2():
-    """Draw docs/figures/figure2.png; all rows but those named otherwise observe e."""
-    rows = [
-        {
-            "system": row["row"],
-            "env": "measured",
-            "disturbed": [
-                one | {"rmse_m": {"mean": 1e-3 * one["rmse_mm"]}}
-                for one in row["forces"]
-            ],
-        }
-        for row in read("figure2")["rows"]
-    ]
-    rows.sort(key=lambda row: style.rank(row["system"]))
-    path = HOME.parent / "docs" / "figures" / "figure2.png"
-    style.save(path, figures.side_forces, rows)
-
-
 BODY = partial(of_scenario, "benchmark", "s3", ("mppi", "koopman_mpc"))
 PLACES = {
     (car, scenario): f"{car}, {scenario.upper()}"
@@ -261,15 +247,20 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("name", choices=(BENCH3.stem, *BENCHMARKS))
+    parser.add_argument("name", choices=(BENCH3.stem, FIGURE1, *BENCHMARKS))
     parser.add_argument("run", nargs="?", help="folder below runs/; the same name")
-    given = parser.parse_args()
-    folder = HOME.parent / "runs" / (given.run or given.name)
+    options = parser.parse_args()
+    # Figure 1 shows an episode of the comparison that makes the paper's table.
+    usual = "table1" if options.name == FIGURE1 else options.name
+    folder = HOME.parent / "runs" / (options.run or usual)
     results = json.loads((folder / "results.json").read_text("utf-8"))
-    if given.name == BENCH3.stem:
+    if options.name == BENCH3.stem:
         return add_to_bench3(results)
-    document = condense(results)
-    write(HOME / f"{given.name}.json", document, document.pop("rows"))
+    if options.name == FIGURE1:
+        document = paper_figures.condense_episode(folder, results)
+    else:
+        document = condense(results)
+    write(HOME / f"{options.name}.json", document, document.pop("rows"))
 
 
 if __name__ == "__main__":
