@@ -50,7 +50,7 @@ Numbers: TypeAlias = Annotated[tuple[float, ...], MayBeEmpty()]
 Names: TypeAlias = Annotated[tuple[str, ...], MayBeEmpty()]
 """Any number of names, none included."""
 Bounds: TypeAlias = Annotated[tuple[Real, ...], MayBeEmpty()]
-"""Lower or upper ends of intervals; none where they are unknown."""
+"""Lower or upper ends of intervals; no entries if they are unknown."""
 
 
 def check_choice(setting: str, value: str, known: Iterable[str]) -> None:
@@ -63,7 +63,7 @@ def check_choice(setting: str, value: str, known: Iterable[str]) -> None:
 def check_intervals(settings: object) -> None:
     """Raise a ValueError for a number of a dataclass outside its annotated interval.
 
-    Of a sequence every entry counts, and None passes.
+    Every entry of a sequence must lie in the interval. None is accepted.
     """
     for name, hint in get_type_hints(type(settings), include_extras=True).items():
         value = getattr(settings, name, None)
@@ -74,7 +74,7 @@ def check_intervals(settings: object) -> None:
 
 
 def _intervals(hint: Any) -> Iterator[Interval]:
-    """The intervals inside an annotation, as of `tuple[Positive, ...] | None`."""
+    """Yield the intervals inside an annotation, as of `tuple[Positive, ...] | None`."""
     for part in get_args(hint):
         if isinstance(part, Interval):
             yield part
@@ -94,6 +94,6 @@ def imported(name: str, setting: str) -> Any:
 
 
 def in_words(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -> str:
-    """Names with their limits, for a person."""
+    """Return names with their limits for a person, as in "speed [m/s] 3 … 12, …"."""
     rows = zip(names, low, high, strict=False)
-    return ", ".join(f"{name} {a:.3g} … {b:.3g}" for name, a, b in rows)
+    return ", ".join(f"{name} {least:.3g} … {most:.3g}" for name, least, most in rows)

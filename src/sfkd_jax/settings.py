@@ -20,10 +20,11 @@ from typing import Any, TypeVar
 from sfkd_jax.ranges import Ascending, Interval, MayBeEmpty
 
 LARGEST = {int: 2**31 - 1, float: 3e38}
-"""What int32 and float32 hold."""
+"""The largest values that int32 and float32 hold."""
 DEFAULT = {int: Interval("[1, inf)"), float: Interval("[0, inf)")}
-"""Of numbers without an annotation."""
+"""The interval of a number that is annotated with none."""
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "words"}
+"""What a value of a type is called in messages."""
 
 T = TypeVar("T")
 Values = Mapping[str, Any]
@@ -35,7 +36,7 @@ class BelowRoot:
 
 
 class OneOf(tuple[str, ...]):
-    """Annotates a word of which there are only these."""
+    """Annotates a setting that must be one of these words."""
 
 
 def takes(
@@ -45,13 +46,15 @@ def takes(
 
     Args:
         factories: functions, whose settings are the keyword-only arguments, and
-            classes, whose settings are the fields. The first that has a name wins.
-        skip: names that something else decides.
+            classes, whose settings are the fields. If several have a setting of one
+            name, the first of them defines it.
+        skip: names that are no settings, because something else decides them.
         parts: name -> dataclass of a nested group of settings.
     """
 
     def decorate(cls: type[T]) -> type[T]:
-        known, added = typing.get_type_hints(cls), {}
+        known = typing.get_type_hints(cls)
+        added: dict[str, Any] = {}
         for name, part in parts.items():
             added[name] = part
             setattr(cls, name, field(default_factory=part))
@@ -70,11 +73,18 @@ def takes(
 
 
 def schema(
-    title: str, base: type[T], *factories: Callable[..., Any], **about: Any
+    title: str, base: type[T], *factories: Callable[..., Any], **options: Any
 ) -> type[T]:
-    """Return a subclass of `base` with the settings of factories, see `takes`."""
-    made: Any = type(title, (base,), {})
-    return takes(*factories, **about)(made)
+    """Return a subclass of `base` with the settings of factories.
+
+    Args:
+        title: name of the subclass.
+        base: a class, with fields or without.
+        factories: functions and classes, see `takes`.
+        options: `skip` and `parts` of `takes`.
+    """
+    subclass: Any = type(title, (base,), {})
+    return takes(*factories, **options)(subclass)
 
 
 def arguments(settings: Any, factory: Callable[..., Any]) -> dict[str, Any]:
@@ -84,7 +94,7 @@ def arguments(settings: Any, factory: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _arguments(factory: Callable[..., Any]) -> dict[str, Any]:
-    """Defaults of the settings of a factory by name."""
+    """Return the settings of a factory with their defaults, by name."""
     return {
         name: parameter.default
         for name, parameter in inspect.signature(factory).parameters.items()
@@ -93,34 +103,43 @@ def _arguments(factory: Callable[..., Any]) -> dict[str, Any]:
     }
 
 
-def parse(kind: type[T], values: Values | T, above: str = "") -> T:
+def parse(dataclass_type: type[T], values: Values | T, group: str = "") -> T:
     """Return plain values as an object of a dataclass, with lists as tuples.
 
-    An object of `kind` is returned as it is; `kind_of`, if a dataclass has it, returns
-    the subclass that fits the values. `above` is the group with a dot, for messages.
+    A dataclass may have a class method `subclass_for(values)`: the object is then of
+    the subclass that this method returns.
+
+    Args:
+        dataclass_type: the dataclass, as `takes` makes it.
+        values: plain values by name; an object of the dataclass is returned as it is.
+        group: the group of the settings with a dot, such as "model.", for messages.
+
+    Raises:
+        ValueError: a value or a name does not fit; the message names the setting.
     """
-    if isinstance(values, kind):
+    if isinstance(values, dataclass_type):
         return values
     if not isinstance(values, Mapping):
-        raise ValueError(f"{above.rstrip('.')} must be settings by name")
-    if choose_kind := getattr(kind, "kind_of", None):
-        kind = choose_kind(values)
-    declared = _hints(kind)
+        raise ValueError(f"{group.rstrip('.')} must be settings by name")
+    if subclass_for := getattr(dataclass_type, "subclass_for", None):
+        dataclass_type = subclass_for(values)
+    declared = _hints(dataclass_type)
     # Names first: a misspelt one would silently leave the setting at its default.
     for name in values:
         if name not in declared:
-            hint = did_you_mean(f"{above}{name}", [above + one for one in declared])
-            raise ValueError(f"unknown setting {above}{name}{hint}")
+            known = [group + known_name for known_name in declared]
+            hint = did_you_mean(f"{group}{name}", known)
+            raise ValueError(f"unknown setting {group}{name}{hint}")
     parsed: dict[str, Any] = {}
-    for entry in fields(typing.cast(Any, kind)):
+    for entry in fields(typing.cast(Any, dataclass_type)):
         name = entry.name
         if name in values:
-            parsed[name] = _checked(above + name, values[name], declared[name])
+            parsed[name] = _checked(group + name, values[name], declared[name])
         elif entry.default is MISSING and entry.default_factory is MISSING:
-            raise ValueError(f"{above}{name} must be set")
+            raise ValueError(f"{group}{name} must be set")
     # Pairs last: both ends have to be lists of numbers before they are compared.
-    _check_boxes(above, parsed)
-    return kind(**parsed)
+    _check_boxes(group, parsed)
+    return dataclass_type(**parsed)
 
 
 def replace(settings: T, **changes: Any) -> T:
@@ -129,8 +148,8 @@ def replace(settings: T, **changes: Any) -> T:
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
+def _hints(dataclass_type: type) -> dict[str, Any]:
+    return typing.get_type_hints(dataclass_type, include_extras=True)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -157,21 +176,27 @@ def _is_below(path: str) -> bool:
 def _checked(name: str, value: Any, hint: Any, *marks: Any) -> Any:
     """Return a value as its annotation states it, with lists as tuples.
 
-    `marks` are what stood beside the annotation `hint` in `Annotated`.
+    Args:
+        name: of the setting, for messages.
+        value: the plain value.
+        hint: the annotation.
+        marks: what stood beside the annotation in `Annotated`, such as an `Interval`.
     """
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    parts = typing.get_args(hint)
     if origin is typing.Annotated:
         return _checked(name, value, parts[0], *parts[1:], *marks)
     if origin in (typing.Union, types.UnionType):
-        kinds = [kind for kind in parts if kind is not types.NoneType]
-        if value is None and len(kinds) < len(parts):
+        alternatives = [part for part in parts if part is not types.NoneType]
+        if value is None and len(alternatives) < len(parts):
             return None
-        # A union of several kinds states nothing that could be checked here.
-        return _checked(name, value, kinds[0] if len(kinds) == 1 else Any, *marks)
+        # A union of several types states nothing that could be checked here.
+        inner = alternatives[0] if len(alternatives) == 1 else Any
+        return _checked(name, value, inner, *marks)
     if is_dataclass(hint):
         return parse(typing.cast(type, hint), value, f"{name}.")
     if origin in (tuple, list):
-        # Tuples where they are asked for: nobody can change what they are given.
+        # A tuple where the annotation says so: the receiver cannot change it.
         return origin(_sequence(name, value, parts, marks))
     if origin is dict and isinstance(value, Mapping):
         return {
@@ -188,7 +213,8 @@ def _sequence(
     name: str, value: Any, parts: tuple[Any, ...], marks: tuple[Any, ...]
 ) -> list[Any]:
     """Return the entries of a list, all of them checked; see `_checked`."""
-    inner, count = parts[0], len(parts)
+    inner = parts[0]
+    count = len(parts)
     problem = None
     if not isinstance(value, list | tuple):
         problem = "a list"
@@ -208,40 +234,52 @@ def _sequence(
     return entries
 
 
-def _problem(value: Any, kind: Any, marks: tuple[Any, ...]) -> str | None:
-    """Return what a number, a word or a truth value must be, if it is not."""
-    if kind not in _WORDS:
+def _problem(value: Any, expected: Any, marks: tuple[Any, ...]) -> str | None:
+    """Return what a number, a word or a truth value must be, or None if it is that.
+
+    `expected` is its type, `marks` what stood beside the type in `Annotated`.
+    """
+    if expected not in _WORDS:
         return None  # nothing is stated about it
     if value is None:
         return "set"
     # bool is a subclass of int: without this `true` would pass for the number 1.
     is_truth = isinstance(value, bool)
-    right = (int, float) if kind is float else kind
-    if is_truth != (kind is bool) or not isinstance(value, right):
-        return _WORDS[kind]
+    accepted = (int, float) if expected is float else expected
+    if is_truth != (expected is bool) or not isinstance(value, accepted):
+        return _WORDS[expected]
     for mark in marks:
         if isinstance(mark, OneOf) and value not in mark:
             return f"one of {', '.join(mark)}"
         if isinstance(mark, BelowRoot) and not _is_below(value):
             return "a path below root without '..', empty parts or \\"
-    if is_truth or isinstance(value, str):
-        return None if is_truth or value.strip() else "words, not nothing"
-    given = (mark for mark in marks if isinstance(mark, Interval))
-    interval = next(given, DEFAULT[kind])
-    inside = math.isfinite(value) and abs(value) <= LARGEST[kind]
-    return None if inside and interval.contains(value) else f"in {interval.text}"
+    if is_truth:
+        return None
+    if isinstance(value, str):
+        return None if value.strip() else "words, not nothing"
+    stated = (mark for mark in marks if isinstance(mark, Interval))
+    interval = next(stated, DEFAULT[expected])
+    representable = math.isfinite(value) and abs(value) <= LARGEST[expected]
+    if representable and interval.contains(value):
+        return None
+    return f"in {interval.text}"
 
 
-def _check_boxes(above: str, settings: Values) -> None:
-    """Check that the lower ends of intervals are below the upper ones."""
-    for low, lower in settings.items():
-        high = low.removesuffix("low") + "high"
-        if not low.endswith("low") or high not in settings:
+def _check_boxes(group: str, settings: Values) -> None:
+    """Check that settings `…low` do not lie above the `…high` of the same name.
+
+    Raises:
+        ValueError: they do, or have another number of entries.
+    """
+    for low_name in settings:
+        high_name = low_name.removesuffix("low") + "high"
+        if not low_name.endswith("low") or high_name not in settings:
             continue
-        ends = list(lower or ()), list(settings[high] or ())
-        crossed = any(a > b for a, b in zip(*ends, strict=False))
-        if crossed or len(ends[0]) != len(ends[1]):
+        low = list(settings[low_name] or ())
+        high = list(settings[high_name] or ())
+        crossed = any(a > b for a, b in zip(low, high, strict=False))
+        if crossed or len(low) != len(high):
             raise ValueError(
-                f"{above}{low} must not lie above {above}{high}, entry by entry, "
-                f"got {ends[0]} and {ends[1]}"
+                f"{group}{low_name} must not lie above {group}{high_name}, "
+                f"entry by entry, got {low} and {high}"
             )

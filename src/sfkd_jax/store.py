@@ -31,14 +31,17 @@ SUFFIX = ".safetensors"
 FORMAT = 2
 """Version of the manifest; a reader refuses every other one."""
 MAX_LINE = 400
-"""Characters of a message, which may quote the file that it is about."""
-LOCK, HOLDER = ".lock", ".lock.holder"
+"""The most characters of a message, which may quote the file that it is about."""
+LOCK = ".lock"
+"""The file in a directory whose lock a writer holds."""
+HOLDER = ".lock.holder"
+"""The file beside it that names the writer."""
 GRACE_S = 2.0
 """Time to wait for a writer that is about to finish [s]."""
 
 
 class ArtefactError(Exception):
-    """A file that cannot be read or written: its name and the reason, in one line."""
+    """A file cannot be read or written; one line with its name and the reason."""
 
 
 class DirectoryLocked(ArtefactError):
@@ -64,8 +67,13 @@ def as_artefact_error(
 ) -> Iterator[None]:
     """Turn exceptions about a file or its content into an ArtefactError.
 
-    Those are OSError, missing keys, wrong types and `also`; `advice` follows what is
-    said about content. An OSError that names another file is about that one.
+    These exceptions are OSError, those of missing keys and wrong types, and `also`. An
+    OSError that names another file is reported about that file.
+
+    Args:
+        path: the file.
+        also: further exceptions that a wrong content may raise.
+        advice: what a message about the content ends with.
     """
     usual = (KeyError, TypeError, IndexError, AttributeError, OverflowError)
     try:
@@ -75,7 +83,9 @@ def as_artefact_error(
         raise failure(named, reason) from reason
     except (*usual, RecursionError, *also) as reason:
         message = f"malformed, {type(reason).__name__}: {reason}"
-        raise failure(path, f"{message}; {advice}" if advice else message) from reason
+        if advice:
+            message = f"{message}; {advice}"
+        raise failure(path, message) from reason
 
 
 def print_message(message: str) -> None:
@@ -116,17 +126,19 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
     lines = []
     for key in dict.fromkeys([*old, *new]):
-        a, b = old.get(key, ...), new.get(key, ...)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            lines += [f"{key}.{line}" for line in differences(a, b)]
+        before = old.get(key, ...)
+        after = new.get(key, ...)
         # True == 1 in Python, but a switch is no number.
-        elif isinstance(a, bool) != isinstance(b, bool) or plain(a) != plain(b):
-            lines.append(f"{key} was {short(a)}, is now {short(b)}")
+        one_is_switch = isinstance(before, bool) != isinstance(after, bool)
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            lines += [f"{key}.{line}" for line in differences(before, after)]
+        elif one_is_switch or plain(before) != plain(after):
+            lines.append(f"{key} was {short(before)}, is now {short(after)}")
     return lines
 
 
 def plain(value: Any) -> Any:
-    """Convert to JSON types: also arrays and settings; NaN and infinities are None."""
+    """Convert a value, also arrays and settings, to JSON types; NaN becomes None."""
     if is_dataclass(value):
         value = vars(value)
     if hasattr(value, "__array__"):
@@ -180,11 +192,16 @@ def write_arrays(
 ) -> dict[str, Any]:
     """Write arrays and their manifest to one file, and return the manifest.
 
-    `sha256` in the manifest identifies the arrays and `content_sha256` the arrays and
-    all settings, independent of order and layout; other documents refer to them.
+    `sha256` in the manifest identifies the arrays, and `content_sha256` the arrays with
+    all settings. Both are independent of order and layout. Other documents refer to
+    them.
 
-    Numbers and truth values alone have a portable form. `config` are the settings that
-    the arrays were made with, `made_from` the hashes of artefacts.
+    Args:
+        path: path of the file, which ends in `SUFFIX`.
+        arrays: numbers and truth values by name; nothing else has a portable form.
+        kind: what the file is, which its readers must ask for.
+        config: the settings that the arrays were made with.
+        made_from: hashes of the artefacts that the arrays were made from, by kind.
     """
     if path.suffix != SUFFIX:
         raise failure(path, f"not written, the name must end in {SUFFIX}")
@@ -217,8 +234,14 @@ def read_arrays(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the arrays of `path` and their manifest; nothing is ever unpickled.
 
-    Another kind or format, other settings than `config`, and arrays or settings that do
-    not match their hashes are refused.
+    Args:
+        path: path of the file.
+        kind: the kind that the file must be of.
+        config: the settings that the arrays must have been made with; None for any.
+
+    Raises:
+        ArtefactError: the file has another kind or format, or other settings, or its
+            arrays or settings do not match their hashes.
     """
     advice = "the file is truncated, damaged or foreign"
     with as_artefact_error(path, SafetensorError, ValueError, advice=advice):
@@ -234,8 +257,9 @@ def read_arrays(
         raise failure(path, "its arrays do not match the sha256 of its manifest")
     changed = [] if config is None else differences(manifest["config"], config)
     if changed:
-        more = f" and {len(changed) - 3} more" if changed[3:] else ""
-        listed = "; ".join(changed[:3]) + more
+        listed = "; ".join(changed[:3])
+        if len(changed) > 3:
+            listed += f" and {len(changed) - 3} more"
         raise failure(path, f"made with other settings: {listed}")
     return arrays, manifest
 
@@ -316,7 +340,8 @@ def truncate_jsonl(
     """Replace `path` by the records to keep; a missing file stays missing."""
     if path.exists():
         kept = filter(keep, read_jsonl(path, keys=keys))
-        write_bytes(path, "".join(f"{json.dumps(one)}\n" for one in kept).encode())
+        text = "".join(f"{json.dumps(record)}\n" for record in kept)
+        write_bytes(path, text.encode())
 
 
 # ---- locks

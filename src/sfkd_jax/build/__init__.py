@@ -69,7 +69,7 @@ class VehicleSettings:
     speed_gain: Positive = 1.0
 
     @classmethod
-    def kind_of(cls, values: Values) -> type[VehicleSettings]:
+    def subclass_for(cls, values: Values) -> type[VehicleSettings]:
         """Return the dataclass of the vehicle of this name."""
         return choose(VEHICLES, values.get("name"), "vehicle")
 
@@ -190,7 +190,7 @@ class ModelSettings:
     environment: bool = True
 
     @classmethod
-    def kind_of(cls, values: Values) -> type[ModelSettings]:
+    def subclass_for(cls, values: Values) -> type[ModelSettings]:
         """Return the dataclass of the model of this name."""
         return choose(MODEL_SETTINGS, values.get("name"), "model")
 

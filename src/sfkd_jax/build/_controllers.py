@@ -78,7 +78,7 @@ class ControllerSettings:
     task: Any = None
 
     @classmethod
-    def kind_of(cls, values: Values) -> type[ControllerSettings]:
+    def subclass_for(cls, values: Values) -> type[ControllerSettings]:
         """Return the dataclass of the planner of this name."""
         name = values.get("planner", "mppi")
         kind = choose(CONTROLLER_SETTINGS, name, "controller.planner")

@@ -90,7 +90,7 @@ class DatasetSettings:
     steps: int = 50
 
     @classmethod
-    def kind_of(cls, values: Values) -> type[DatasetSettings]:
+    def subclass_for(cls, values: Values) -> type[DatasetSettings]:
         """Return the dataclass of logs, of path coordinates or of the world."""
         if "path" in values:
             return LogSettings
