@@ -6,7 +6,7 @@ import pytest
 from composing import settings
 from helpers import last_line, run_command
 
-from sfkd_jax import demo
+from sfkd_jax import demo, policy
 
 BODY = ("+experiment=s3_body", "controller=mppi_tiny")
 PATH = ("controller.mppi.num_samples=30",)
@@ -33,7 +33,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
         assert own["rmse_m"]["mean"] < 0.5 * rows["nominal"]["rmse_m"]["mean"]
         assert own["departures"] == 0
     else:
-        file = demo.SHIPPED / "kinematic_path" / "certificate.json"
+        file = policy.SHIPPED / "kinematic_path" / "certificate.json"
         corridor = json.loads(file.read_text())["corridor"]
         assert own["max_deviation_m"] <= corridor["corridor_m"]
         assert f"corridor {corridor['corridor_m']:.3f} m to each side" in done.stderr

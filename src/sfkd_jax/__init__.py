@@ -8,12 +8,14 @@ if TYPE_CHECKING:
     from sfkd_jax.geometry import relative as relative
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
+    from sfkd_jax.policy import policies as policies
     from sfkd_jax.store import ArtefactError as ArtefactError
 
 __version__ = "0.1.0"
 
 _LAZY = {
     "load": "policy",
+    "policies": "policy",
     "Policy": "policy",
     "relative": "geometry",
     "warm_up": "export",

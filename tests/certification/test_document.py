@@ -15,7 +15,7 @@ import pytest
 from helpers import put, refusal_of
 from jaxtyping import TypeCheckError
 
-from sfkd_jax import demo, policy, rollout, store
+from sfkd_jax import policy, rollout, store
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -30,12 +30,12 @@ POLICIES = ("kinematic", "dynamic", "kinematic_path", "dynamic_path")
 
 @cache
 def shipped(plant="kinematic"):
-    return policy.restore(demo.SHIPPED / plant)
+    return policy.restore(policy.SHIPPED / plant)
 
 
 @cache
 def honest(plant="kinematic"):
-    return store.read_json(demo.SHIPPED / plant / "certificate.json")
+    return store.read_json(policy.SHIPPED / plant / "certificate.json")
 
 
 @cache
@@ -104,7 +104,7 @@ def test_no_forged_entry_is_accepted(plant, monkeypatch):
         ("fingerprint", honest(plant)["params_sha256"]),
     ):
         monkeypatch.setattr(_verification, name, lambda *_, known=known: known)
-    document = {"": store.read_json(demo.SHIPPED / plant / "certificate.json")}
+    document = {"": store.read_json(policy.SHIPPED / plant / "certificate.json")}
     rules = schema(document[""], shipped(plant), weights_of(plant))
     accepted, tried = [], Counter()
 
@@ -163,13 +163,13 @@ def another(value):
 
 @pytest.fixture
 def copied(tmp_path):
-    shutil.copytree(demo.SHIPPED / "kinematic", tmp_path / "run")
+    shutil.copytree(policy.SHIPPED / "kinematic", tmp_path / "run")
     return tmp_path / "run"
 
 
 def test_the_hash_changes_with_every_single_setting():
     _, manifest = store.read_arrays(
-        demo.SHIPPED / "kinematic" / "policy.safetensors", kind=policy.KIND
+        policy.SHIPPED / "kinematic" / "policy.safetensors", kind=policy.KIND
     )
     settings = dict(leaves(manifest["config"]))
     changed = {
@@ -253,7 +253,7 @@ def test_a_policy_that_contradicts_its_own_law_does_not_load(
     tmp_path, name, value, message
 ):
     """With hashes that are right."""
-    shipping = demo.SHIPPED / "kinematic_path" / "policy.safetensors"
+    shipping = policy.SHIPPED / "kinematic_path" / "policy.safetensors"
     arrays, manifest = store.read_arrays(shipping, kind=policy.KIND)
     config = manifest["config"]
     if name not in arrays:
@@ -277,7 +277,7 @@ def test_a_sampling_period_that_is_not_that_of_the_data_does_not_load(copied):
 
 def test_a_policy_with_a_shield_loads_with_one_or_if_asked_without(tmp_path):
     run = tmp_path / "run"
-    shutil.copytree(demo.SHIPPED / "kinematic_path", run)
+    shutil.copytree(policy.SHIPPED / "kinematic_path", run)
     (run / "certificate.json").unlink()
     line = refusal_of(lambda: policy.load(run))
     assert "controller.shield needs a certified corridor" in line
@@ -292,7 +292,7 @@ def test_a_policy_with_a_shield_loads_with_one_or_if_asked_without(tmp_path):
 
 def test_what_ships_loads_in_double_precision():
     code = "import sys, sfkd_jax; print(all(sfkd_jax.load(run).certificate for run in sys.argv[1:]))"
-    command = [sys.executable, "-c", code, *(demo.SHIPPED / name for name in POLICIES)]
+    command = [sys.executable, "-c", code, *(policy.SHIPPED / name for name in POLICIES)]
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.stdout == "True\n", done.stderr[-2000:]

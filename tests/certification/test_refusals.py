@@ -9,7 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, certified, jit, model_and_params
 
 import sfkd_jax
-from sfkd_jax import demo
+from sfkd_jax import policy
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
@@ -104,7 +104,7 @@ def test_certificates_that_ship_survive_other_roundings(car, monkeypatch):
         return jax.tree.map(rounded, exported(*about))
 
     monkeypatch.setattr(_verification, "exported", served)
-    assert sfkd_jax.load(demo.SHIPPED / f"{car}_path").certificate
+    assert sfkd_jax.load(policy.SHIPPED / f"{car}_path").certificate
 
 
 # --- attacks --------------------------------------------------------------------------

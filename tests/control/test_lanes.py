@@ -379,7 +379,7 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
 
 @pytest.mark.parametrize("name", ["dynamic_path", "kinematic_path"])
 def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
-    policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{name}")
+    policy = sfkd_jax.load(name)
     driver, size = policy.in_lane(), len(policy.vehicle.state_names)
     posts, at = circles(beside(road, POSTS), 0.8), jnp.zeros(size)
 
@@ -394,4 +394,4 @@ def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
         jax.eval_shape(told, road._replace(left=jnp.ones(3)))
     with pytest.raises(ValueError, match="no certified corridor"):
-        sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/dynamic").in_lane()
+        sfkd_jax.load("dynamic").in_lane()

@@ -18,11 +18,15 @@ from sfkd_jax.control import behind, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.policy._description import FRICTION_AND_WIND as FRICTION_AND_WIND
 from sfkd_jax.policy._description import describe, interface_of
+from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
+from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
+from sfkd_jax.policy._shipped import policies as policies
 from sfkd_jax.policy._trained import KIND as KIND
 from sfkd_jax.policy._trained import LAW as LAW
 from sfkd_jax.policy._trained import TrainedModel as TrainedModel
 from sfkd_jax.policy._trained import built as built
-from sfkd_jax.policy._trained import policy_file, policy_numerics
+from sfkd_jax.policy._trained import policy_file as policy_file
+from sfkd_jax.policy._trained import policy_numerics
 from sfkd_jax.policy._trained import restore as restore
 from sfkd_jax.policy._trained import save as save
 from sfkd_jax.rollout import fold, on_host, unfold
@@ -150,7 +154,8 @@ def load(
     Without a certificate it warns and gives the reason.
 
     Args:
-        path: path of the directory, or of a policy.safetensors.
+        path: path of the directory or of a policy.safetensors, or the name of a policy
+            that ships, see `policies`.
         controller: settings of a controller to build instead of the saved one.
         env_source: one of `build.ENV_SOURCES`. "estimated" for a policy in path
             coordinates that estimates the environment and ignores the one it is given;

@@ -9,6 +9,8 @@ from sfkd_jax import store
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """A folder for each shipped policy, as `train` wrote it."""
+POLICY_FILE = f"policy{store.SUFFIX}"
+"""Name of the file of weights, law and settings in a run directory."""
 
 
 class ShippedPolicy(NamedTuple):
@@ -37,13 +39,13 @@ class ShippedPolicy(NamedTuple):
 
 
 def policies() -> dict[str, ShippedPolicy]:
-    """Return the policies that ship with the package, by the names that `load` takes."""
+    """Return the policies that ship, by the names that `load` takes."""
     return {name: _summary(SHIPPED / name) for name in shipped_names()}
 
 
 def shipped_names() -> list[str]:
     """Return the names of the policies that ship with the package."""
-    return sorted(file.parent.name for file in SHIPPED.glob(f"*/policy{store.SUFFIX}"))
+    return sorted(file.parent.name for file in SHIPPED.glob(f"*/{POLICY_FILE}"))
 
 
 def _summary(folder: Path) -> ShippedPolicy:

@@ -16,6 +16,7 @@ import numpy as np
 from sfkd_jax import build, store
 from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.plants import Vehicle
+from sfkd_jax.policy._shipped import POLICY_FILE, SHIPPED, shipped_names
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Model, Params
 
@@ -90,7 +91,8 @@ def restore(path: str | Path) -> TrainedModel:
     """Return the model and weights in a run directory.
 
     Args:
-        path: path of the directory, or of a policy.safetensors.
+        path: path of the directory or of a policy.safetensors, or the name of a policy
+            that ships, see `policies`.
 
     Raises:
         ArtefactError: the file is missing, truncated, foreign or changed since it was
@@ -153,11 +155,29 @@ def _built_from_json(settings: str) -> tuple[Vehicle, Model]:
 
 
 def policy_file(path: str | Path) -> Path:
-    """Return policy.safetensors of a run directory, or the file itself."""
-    path = Path(path)
-    if path.suffix == store.SUFFIX:
-        return path
-    return path / "policy.safetensors"
+    """Return the policy.safetensors that a path or the name of a shipped policy means.
+
+    Args:
+        path: of a run directory, of the file itself, or a name of `policies`. A path
+            that exists comes before a name.
+
+    Raises:
+        ArtefactError: a single word that is neither.
+    """
+    file = Path(path)
+    if file.suffix == store.SUFFIX:
+        return file
+    # "./name" is a path; "name" may be either.
+    is_a_word = str(path) == file.name
+    if is_a_word and not file.exists():
+        shipped = shipped_names()
+        if file.name not in shipped:
+            raise store.ArtefactError(
+                f"{path}: no such run directory, and no policy of this name ships with "
+                f"the package; there are {', '.join(shipped)}"
+            )
+        file = SHIPPED / file.name
+    return file / POLICY_FILE
 
 
 def _as_params(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Params:
