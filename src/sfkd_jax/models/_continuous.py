@@ -203,7 +203,8 @@ def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
         return jnp.concatenate([*parts, space.scaled_env(env)])
 
     def identify(train: Trajectory, held_out: Trajectory, key: Key) -> Params:
-        before, after = train.states[:, :-1], train.states[:, 1:]
+        before = train.states[:, :-1]
+        after = train.states[:, 1:]
         read = jax.vmap(jax.vmap(inputs))(before, train.controls, train.envs)
         read = read.reshape(-1, read.shape[-1])
         moved = jax.vmap(jax.vmap(_increment))(before, after).reshape(-1, outputs)
@@ -332,7 +333,8 @@ def affine_rates(
         return jnp.concatenate([parts[name] for name in names])
 
     start = jnp.zeros(sum(sizes[name] for name in reading))
-    inputs, outputs = sum(sizes[name] for name in driving), 3 + sizes["body"]
+    inputs = sum(sizes[name] for name in driving)
+    outputs = 3 + sizes["body"]
     # Two networks, as published, rather than one with two heads.
     f = mlp(hidden, outputs, activations, last=last)
     G = mlp(hidden, outputs * inputs, activations, last=last)

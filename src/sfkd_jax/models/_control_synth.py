@@ -95,7 +95,8 @@ def control_synth(
 
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """
-    body, control = space.body_mean.shape[0], space.control_mean.shape[0]
+    body = space.body_mean.shape[0]
+    control = space.control_mean.shape[0]
     # A network of u and e alone: it adds the same to any two solutions.
     inputs = mlp(input_hidden, 3 + body, (nn.tanh,) * len(input_hidden), last=0.1)
 
@@ -127,7 +128,8 @@ def control_synth(
         }
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
-        change, twist = contracting(params["free"], rate), Synthesis(**params["twist"])
+        change = contracting(params["free"], rate)
+        twist = Synthesis(**params["twist"])
         return ControlSynthFiber(change, twist, params["inputs"], env)
 
     def rates(
@@ -150,11 +152,13 @@ def contracting(free: Params, rate: float) -> Synthesis:
     body, hidden = free["B"].shape
     entries = jnp.tanh(free["T"])  # so that the metric stays well conditioned
     T = jnp.tril(entries, -1) + jnp.diag(jnp.exp(jnp.diag(entries)))
-    T_inverse, P = jnp.linalg.inv(T), T.T @ T
+    T_inverse = jnp.linalg.inv(T)
+    P = T.T @ T
     # Multipliers as exponentials: positive without a constraint.
     roots = GAIN * hidden**-0.5 * jnp.exp(0.5 * free["log_multipliers"])
     # Scaled by the width, so that norms do not grow with the number of units.
-    B, W = hidden**-0.5 * free["B"], GAIN * hidden**-0.5 * free["W"]
+    B = hidden**-0.5 * free["B"]
+    W = GAIN * hidden**-0.5 * free["W"]
     A = B - W.T
     # The skew part turns without growth: it cancels in the symmetric inequality.
     linear = free["Y"] - free["Y"].T - 0.25 * B @ B.T - 0.5 * free["X"] @ free["X"].T

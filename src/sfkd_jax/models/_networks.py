@@ -73,7 +73,8 @@ class Sandwich(nn.Module):
         gamma = jnp.asarray(bound) * (1.0 - FLOAT32_MARGIN)
         sizes = (self.inputs, *self.hidden, self.outputs)
         spread = nn.initializers.lecun_normal()
-        matrices, multipliers = [], []
+        matrices = []
+        multipliers = []
         # `left` carries A_{k-1}' Ψ_{k-1} on; √γ goes in at either end.
         left = jnp.sqrt(gamma) * jnp.eye(self.inputs)
         for k, (before, after) in enumerate(pairwise(sizes)):

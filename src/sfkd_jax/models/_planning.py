@@ -29,10 +29,10 @@ from sfkd_jax.types import (
 
 FREE = 2
 """Entries of a control that differ by sample; along a path κ and v_ref follow."""
-HIDDEN, WIDTH = 64, 64
-"""Widths of g, and of the network that gives its weights; on a known road half of the
-first is enough.
-"""
+HIDDEN = 64
+"""Hidden width of g in the frame of the car; along a known road half of it is enough."""
+WIDTH = 64
+"""Width of the network that gives the weights of g."""
 SCALE = 0.005
 """Of M, N, m and V: g is small."""
 
@@ -96,7 +96,8 @@ class Planning:
         """Number of inputs of g, and the ends of its parts in the table."""
         body = self.space.body_mean.shape[0]
         # Along a path there is no pose: that of the start stays.
-        inputs, out = body + FREE, body + 3 * (not self.certified.along_path)
+        inputs = body + FREE
+        out = body + 3 * (not self.certified.along_path)
         parts = out * (inputs + 1), self._hidden * (inputs + 1), out * self._hidden
         return inputs, list(accumulate(parts))
 
@@ -132,7 +133,8 @@ class Planning:
 
     def step(self, fiber: PlanningFiber, state: State, control: Control) -> State:
         """Advance the state, or (ξ, 1) along a path, by one sampling period."""
-        nu, g = control[:FREE], fiber.residual
+        nu = control[:FREE]
+        g = fiber.residual
         if not self.certified.along_path:
             after = self._certified(fiber, state, control)
             added = g(jnp.append(state[BODY], 1.0), nu)
@@ -149,10 +151,12 @@ class Planning:
 
     def on_road(self, fiber: PlanningFiber, road: Control) -> PlanningFiber:
         """Return the fiber of steps on a road, with F in the affine part of g."""
-        (certified, at), (weights, env) = self._on_path(fiber, road), fiber.residual
+        certified, at = self._on_path(fiber, road)
+        weights, env = fiber.residual
         A, B = jax.jacfwd(certified, (0, 1))(*at)
         offset = certified(*at) - A @ at[0]
-        g, size = self._residual(weights, env, road), A.shape[0]
+        g = self._residual(weights, env, road)
+        size = A.shape[0]
         # The entry 1 stays.
         one = jnp.eye(size + 1)[-1:]
         affine = jnp.column_stack([A, offset]) + g.of_state[:size]
@@ -174,7 +178,8 @@ class Planning:
 
     def model(self) -> Model:
         """Return F, in place of which planners roll out F + g."""
-        size, F = 3 + self.space.body_mean.shape[0], self.certified
+        size = 3 + self.space.body_mean.shape[0]
+        F = self.certified
         planning = state_model(self.init, self.fiber, self.step, state_size=size)
         planning = planning._replace(shared=F.shared, along_path=F.along_path)
         if F.along_path:
@@ -197,9 +202,12 @@ class Planning:
         self, weights: Params, env: Environment, road: Control | None = None
     ) -> Residual:
         """Return g of scaled e and a road, in the units of states and controls."""
-        space, (inputs, ends), reads = self.space, self._sizes, env
+        space = self.space
+        inputs, ends = self._sizes
+        reads = env
         if road is not None:
-            mean, scale = space.control_mean[FREE:], space.control_scale[FREE:]
+            mean = space.control_mean[FREE:]
+            scale = space.control_scale[FREE:]
             reads = jnp.append((road - mean) / scale, env)
         table = cast(Array, self._network.apply({"params": weights}, reads))
         affine, hidden, out = jnp.split(table, ends[:-1])

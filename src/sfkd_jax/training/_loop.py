@@ -23,7 +23,10 @@ from sfkd_jax.types import Key, Model, Params, Trajectory
 Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
 WARM_UP = 100
 """Steps until the largest learning rate, in all but short runs."""
-LOG, RECORD = "metrics.jsonl", "training.json"
+LOG = "metrics.jsonl"
+"""File of the losses, one JSON object a line."""
+RECORD = "training.json"
+"""File that tells one training from another."""
 FINAL_RATE = 0.01
 """Last learning rate relative to the largest."""
 
@@ -110,12 +113,14 @@ def fit(
     def first_loss() -> float:
         return float(loss.validate(begin(init_key).params, held_out)[0])
 
-    checkpoints, log = Checkpoints(directory / "checkpoints"), directory / LOG
+    checkpoints = Checkpoints(directory / "checkpoints")
+    log = directory / LOG
     try:
         _claim(directory, record, first_loss, checkpoints.latest_step())
         # Of a new run it is the state as it was.
         state = checkpoints.resume(begin(init_key))
-        start, began = int(state.step), time.perf_counter()
+        start = int(state.step)
+        began = time.perf_counter()
         # Lines of steps after the checkpoint would be there twice.
         store.truncate_jsonl(
             log, lambda line: line["step"] in range(start + 1), keys=("step",)
@@ -190,7 +195,8 @@ def _claim(
     latest: int | None,
 ) -> None:
     """Record a training beside its checkpoints, or refuse those of another one."""
-    path, loss = directory / RECORD, "loss before the first step"
+    path = directory / RECORD
+    loss = "loss before the first step"
     if latest is None:
         # As text: it may be no number that JSON knows.
         store.write_json(path, record | {loss: f"{first_loss():.6g}"})

@@ -133,7 +133,8 @@ def multi_step_loss(
         # Its bounds are enforced once for all that reads the weights.
         params = fold(model, params)
         parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
-        scores, gaps = parts.pop("score"), parts.pop("gap")
+        scores = parts.pop("score")
+        gaps = parts.pop("gap")
         parts = {name: jnp.mean(part) for name, part in parts.items()}
         start = jnp.zeros(())
         # After the mean over windows: a tube belongs to the batch, not to one of them.
@@ -175,7 +176,8 @@ def planning_loss(model: Model, params: Params, space: Space) -> Loss:
     right where its steps are.
     """
     # Folded, since what is certified is frozen.
-    units, frozen = error_units(model, space) / 0.001, fold(model, params)
+    units = error_units(model, space) / 0.001
+    frozen = fold(model, params)
     planning = model.planning or model
 
     def error(weights: Params, data: Trajectory) -> Scalar:

@@ -30,6 +30,7 @@ from sfkd_jax.ranges import (
     check_intervals,
 )
 from sfkd_jax.types import (
+    GRAVITY,
     Control,
     Controller,
     ControllerInfo,
@@ -42,7 +43,6 @@ from sfkd_jax.types import (
 
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
-GRAVITY = 9.81
 LOST = 10.0
 """Distance from where the car should be, at which it is somewhere else [m]."""
 
@@ -111,7 +111,8 @@ class InLane(Stateful):
     def init(self, key: Key) -> LaneState:
         """Return the state before the first control step."""
         inner, planner = jax.random.split(key)
-        none, rest = jnp.zeros((3, self.samples)), jnp.zeros(self.samples)
+        none = jnp.zeros((3, self.samples))
+        rest = jnp.zeros(self.samples)
         return LaneState(
             inner=self.inner.init(inner),
             planner=self.planner.init(planner),
@@ -131,7 +132,8 @@ class InLane(Stateful):
         scene: Scene,
     ) -> tuple[Control, LaneState, ControllerInfo]:
         """Take one control step."""
-        task, weights = self.manoeuvres, state.planner.tuning.cost
+        task = self.manoeuvres
+        weights = state.planner.tuning.cost
         scene, clean = finite(*scene)
         progress, situation = self._situation(state, observation, env, scene, clean)
         path = scene[0].path
@@ -184,9 +186,12 @@ class InLane(Stateful):
         clean: Bool[Array, ""],
     ) -> tuple[Scalar, Situation]:
         """Where the car is along the path [m], and what references are judged by."""
-        (lane, obstacles), kind = scene, self.manoeuvres.kind
-        path, position = lane.path, observation[:2]
-        index, square = state.committed.index, state.committed.square
+        lane, obstacles = scene
+        kind = self.manoeuvres.kind
+        path = lane.path
+        position = observation[:2]
+        index = state.committed.index
+        square = state.committed.square
         known = all_finite(observation)
         guess = state.progress + self.manoeuvres.dt * jnp.sqrt(square[BEHIND])
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
@@ -213,14 +218,16 @@ class InLane(Stateful):
         committed = jax.tree.map(partial(jnp.where, fresh), begun, held)
         friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
         friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
-        place, grip = progress / path.spacing - first, GRAVITY * friction
+        place = progress / path.spacing - first
+        grip = GRAVITY * friction
         return progress, Situation(road, committed, obstacles, place, grip, clean)
 
     def _search(
         self, planner: Any, situation: Situation, kept: Judged, free: Bool[Array, ""]
     ) -> tuple[Any, Committed, Bool[Array, ""]]:
         """Return the state of the planner, the reference to commit, if it was found."""
-        task, before = self.manoeuvres, situation.committed
+        task = self.manoeuvres
+        before = situation.committed
         # Its observation is a situation; it needs neither e nor a reference.
         act: Any = self.planner.act
         row, after, info = act(None, planner, situation, None, None)

@@ -33,12 +33,16 @@ ALMOST = 0.95
 """Share of the grip of a stop that cannot be gentler."""
 BEND = 5.77
 """Largest second derivative of a quintic between rests, by its height and length²."""
-EVASIVE, TRACKED = 0.85, 3.0
-"""Share of the grip of an evasion; largest v² κ that a law can still follow [m/s²]."""
-ENDS, LENGTHS, BRAKING = range(-5, 6), (0.7, 0.85, 1.0, 1.25), (0.0, 0.4, 0.8)
-"""Of evasions: where they end, in fifths of the free lane; lengths, relative to the one
-that takes all of the grip; shares of what it leaves for the brakes.
-"""
+EVASIVE = 0.85
+"""Share of the grip that an evasion uses."""
+TRACKED = 3.0
+"""Largest v² κ that a law can still follow [m/s²]."""
+ENDS = range(-5, 6)
+"""Lateral positions at which evasions end, in fifths of the free lane."""
+LENGTHS = (0.7, 0.85, 1.0, 1.25)
+"""Lengths of evasions, relative to the length that takes all of the grip."""
+BRAKING = (0.0, 0.4, 0.8)
+"""Shares of the grip left over by the lateral move that evasions brake with."""
 LATE = 0.03
 """Distances are those at samples; in between an obstacle may be nearer by less [m]."""
 
@@ -173,8 +177,10 @@ class Manoeuvres:
 
     def reference(self, situation: Situation, row: Control) -> Committed:
         """Return the reference of a row of parameters."""
-        road, before = situation.road, situation.committed
-        spacing, count = road.spacing, before.square.shape[0]
+        road = situation.road
+        before = situation.committed
+        spacing = road.spacing
+        count = before.square.shape[0]
         longest, middle = _lengths(road)
         first, second = jnp.clip(row[1:4:2] + middle, SHORTEST, longest)
         ahead = spacing * jnp.arange(count - SPLICE)
@@ -199,8 +205,10 @@ class Manoeuvres:
         Of the next two obstacles both, or the second alone. Few samples fall into the
         gap between two of them, and none from one side of it to the other.
         """
-        road, spacing = situation.road, situation.road.spacing
-        (longest, middle), splice = _lengths(road), spacing * SPLICE
+        road = situation.road
+        spacing = situation.road.spacing
+        longest, middle = _lengths(road)
+        splice = spacing * SPLICE
         known, ahead = self._ahead(situation)
         # Instead of one that is not there: the middle of the road at the horizon.
         none = jnp.asarray([spacing * road.curvature.shape[0], 0.0, 0.0])[:, None]
@@ -214,7 +222,8 @@ class Manoeuvres:
             start, over = (left[0], to_both) if both else (left[1], to_second)
             return jnp.stack([start, over[0], left[1], over[1], slower])
 
-        sides, speeds = (1.0, -1.0), jnp.asarray([0.0, -2.0, -4.0])
+        sides = (1.0, -1.0)
+        speeds = jnp.asarray([0.0, -2.0, -4.0])
         ways = [row(one, two, v, True) for one, two, v in product(sides, sides, speeds)]
         ways += [row(0.0, two, v, False) for two, v in product(sides, speeds)]
         return jnp.stack(ways)
@@ -227,7 +236,9 @@ class Manoeuvres:
         From where on the car is beside each, its distance to the left of the road, and
         how far aside from that the middle of the car has to be [m].
         """
-        road, kind, obstacles = situation.road, self.kind, situation.obstacles
+        road = situation.road
+        kind = self.kind
+        obstacles = situation.obstacles
         samples = jnp.arange(road.curvature.shape[0])
         away = road.spacing * jnp.maximum(samples - situation.place, 0.0)
         speed = jnp.sqrt(situation.committed.square[BEHIND])
@@ -244,14 +255,17 @@ class Manoeuvres:
 
         `standoff` if that fills the lane.
         """
-        road, kind, signs = situation.road, self.kind, jnp.asarray([[1.0], [-1.0]])
+        road = situation.road
+        kind = self.kind
+        signs = jnp.asarray([[1.0], [-1.0]])
         (begin, aside, room), ahead = self._ahead(situation)
         sides = aside + signs * room
         # What the sides lack of comfort does not keep it from passing.
         lacks = signs * sides + kind.half[1] + kind.margin - self.comfort
         lacks -= jnp.stack([road.left[block], road.right[block]])[:, None]
         shift = jnp.abs(sides - situation.committed.move[0, block])
-        bends, turns = BEND / kind.curvature * shift, 60.0 / kind.turning * shift
+        bends = BEND / kind.curvature * shift
+        turns = 60.0 / kind.turning * shift
         length = jnp.maximum(jnp.sqrt(bends), jnp.cbrt(turns)) + road.spacing * SPLICE
         length = jnp.min(jnp.where(lacks <= 0.0, length, jnp.inf), axis=0)
         # All that stand there together, within 4 m, may block it, and any may leave.
@@ -261,7 +275,8 @@ class Manoeuvres:
 
     def stop(self, situation: Situation, judged: Judged) -> Committed:
         """Return the committed reference with a stop before what blocks it."""
-        before, spacing = situation.committed, situation.road.spacing
+        before = situation.committed
+        spacing = situation.road.spacing
         samples = jnp.arange(before.square.shape[0])
         start = before.square[BEHIND]
         # Beside the lateral acceleration of the bend.
@@ -269,7 +284,8 @@ class Manoeuvres:
         grip = jnp.sqrt(jnp.maximum((ALMOST * situation.grip) ** 2 - bend**2, 0.01))
         grip = jnp.minimum(grip, self.kind.braking)
         gentle = jnp.minimum(self.kind.deceleration, grip)
-        block, here = jnp.argmax(judged.blocked), situation.place * spacing
+        block = jnp.argmax(judged.blocked)
+        here = situation.place * spacing
         # Where there is time it stands so far away that it can still turn.
         far = jnp.maximum(self._turning(situation, block), self.standoff)
         until = jnp.minimum(
@@ -308,8 +324,11 @@ class Manoeuvres:
         self, situation: Situation, end: Scalar, longer: Scalar, braking: Scalar
     ) -> Committed:
         """A lateral move with the grip, braking with what it leaves."""
-        road, before, kind = situation.road, situation.committed, self.kind
-        start, count = before.square[BEHIND], before.square.shape[0]
+        road = situation.road
+        before = situation.committed
+        kind = self.kind
+        start = before.square[BEHIND]
+        count = before.square.shape[0]
         grip = EVASIVE * situation.grip
         pull = jnp.minimum(grip, TRACKED)
         # At low speed it ends where the class does.
@@ -330,7 +349,9 @@ class Manoeuvres:
 
     def judge(self, weights: Any, situation: Situation, plan: Committed) -> Judged:
         """Return what a reference costs, how far it leaves the class, and its room."""
-        road, kind, square = situation.road, self.kind, plan.square
+        road = situation.road
+        kind = self.kind
+        square = plan.square
         lateral = jnp.minimum(kind.lateral, kind.share * situation.grip)
         along = curve(road, plan)
         curvature = along.curvature
@@ -367,7 +388,8 @@ class Manoeuvres:
         self, situation: Situation, move: Float[Array, "3 sample"], along: Curve
     ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
         """What obstacles and edges leave beyond what is needed [m]."""
-        road, half = situation.road, self.kind.half
+        road = situation.road
+        half = self.kind.half
         samples = jnp.arange(along.times.shape[0])
         now = jnp.interp(situation.place, samples, along.times)
         steps = jnp.maximum(along.times - now, 0.0) / self.dt
@@ -385,7 +407,8 @@ class Manoeuvres:
         edge = edge - half[1] - half[0] * jnp.abs(move[1]) / along.stretch
         # The car is between two samples, and both count, also where it stands.
         counts = (along.reached | (samples == BEHIND + 1)) & (samples >= BEHIND)
-        gap, edge = gap - LATE - self.kind.margin, edge - self.kind.margin
+        gap = gap - LATE - self.kind.margin
+        edge = edge - self.kind.margin
         gap = jnp.where(situation.clean, jnp.where(counts, gap, jnp.inf), -jnp.inf)
         return gap, jnp.where(counts, edge, jnp.inf)
 

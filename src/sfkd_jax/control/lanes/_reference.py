@@ -81,12 +81,14 @@ def road_ahead(
 
     `accelerations` are the largest, and the largest deceleration [m/s²].
     """
-    path, last = lane.path, lane.path.points.shape[0] - 1
+    path = lane.path
+    last = lane.path.points.shape[0] - 1
     numbers = index + jnp.arange(count)
     rows = jnp.clip(numbers, 0, last)
     ended = numbers >= last
     if isinstance(path, Lap):
-        rows, ended = numbers % last, False
+        rows = numbers % last
+        ended = False
     squares = jnp.where(ended, 0.0, lane.speed[rows] ** 2)
     # From behind: at each sample what can still slow down to all that follow.
     ahead = 2.0 * path.spacing * jnp.arange(count)
@@ -113,12 +115,14 @@ def curve(road: RoadAhead, plan: Committed) -> Curve:
     dψ/ds = κ_r + (d'' (1 − κ_r d) + d' (κ_r' d + κ_r d')) / |dp/ds|²
     """
     d, first, second = plan.move
-    bend, (cos, sin) = road.curvature, road.direction
+    bend = road.curvature
+    cos, sin = road.direction
     scale = 1.0 - bend * d
     square = scale**2 + first**2
     stretch = jnp.sqrt(square)
     turn = bend + (second * scale + first * (road.slope * d + bend * first)) / square
-    forward, aside = scale / stretch, first / stretch
+    forward = scale / stretch
+    aside = first / stretch
     lengths = 0.5 * road.spacing * (stretch[1:] + stretch[:-1])
     speed = jnp.sqrt(plan.square)
     both = speed[1:] + speed[:-1]
@@ -162,7 +166,8 @@ def window(
 
     `along` is the same reference in the world, `place` that of the car, in samples.
     """
-    squares, spacing = committed.square, path.spacing
+    squares = committed.square
+    spacing = path.spacing
     speed = jnp.sqrt(squares)
     slopes = 0.5 * jnp.diff(squares) / along.lengths
     last = squares.shape[0] - 2

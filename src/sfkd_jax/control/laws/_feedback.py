@@ -31,22 +31,31 @@ than any model sees.
 """
 GRIP = 2.5
 """Lateral acceleration of a law that does not know its own [m/s²]: a wet road."""
-# Chosen by a random search on noisy closed loops of both benchmark cars, with tabled
-# gains and with those of a hand. Lengths and times scale with the law and its grip.
-ARC, CORNERING, SHARED = 0.63, 0.89, 0.65
-"""Shares of the grip that arc, steering and the turn's part of the circle may use."""
+# The constants from here to `BRAKING` were chosen by a random search on noisy closed
+# loops of both benchmark cars, with tabled gains and with gains chosen by hand. Lengths
+# and times scale with the law and its grip.
+ARC = 0.63
+"""Share of the grip that the arc of the approach may use."""
+CORNERING = 0.89
+"""Share of the grip that the steering may use."""
+SHARED = 0.65
+"""Share of the friction circle that is counted as used in the tightest turn."""
 STEEPEST = 1.13
 """Largest angle of approach [rad]."""
 DAMPING = 1.73
 """Of the rates of the body, relative to the linear law."""
 CIRCLE = 2.58
 """Radius of the tightest turn, relative to d steering / d curvature."""
-ASTRAY, DISTANT = (0.31, 1.12), (0.17, 2.1)
-"""Angle [rad] and |e_y| [radii of that turn] from which on the vehicle slows down, and
-over which it reaches its lowest speed.
+ASTRAY = (0.31, 1.12)
+"""Angle from the approach at which the vehicle begins to slow down, and the further
+angle over which it reaches its lowest speed [rad].
 """
-FASTER, BRAKING = 0.45, 2.8
-"""Largest drive and braking that feedback asks for, relative to the grip."""
+DISTANT = (0.17, 2.1)
+"""The same two numbers for |e_y|, in radii of the tightest turn."""
+FASTER = 0.45
+"""Largest drive that feedback requests, relative to the grip."""
+BRAKING = 2.8
+"""Largest braking that feedback requests, relative to the grip."""
 SLOW_STEERING = 5.0
 """Below this speed a law steers over a time and not over a distance [m/s]."""
 CREEP = 0.2
@@ -123,7 +132,8 @@ def course(turn: SteadyTurn, errors: PathState) -> tuple[Scalar, ...]:
     """
     shares = [jnp.abs(errors[entry]) / NEAR[entry] for entry in range(len(NEAR))]
     far = reduce(jnp.maximum, shares) - 1.0
-    aside, steering = jnp.abs(errors[LATERAL]), turn.gain[0]
+    aside = jnp.abs(errors[LATERAL])
+    steering = turn.gain[0]
     # A law that does not steer has no approach.
     slope = steering[LATERAL] / jnp.maximum(steering[HEADING], 1e-6)
     speed = turn.state[PATH_SPEED] + errors[PATH_SPEED]
@@ -149,7 +159,9 @@ def recovering(
     steering and drive share the grip a.
     """
     turned, astray, far, tightest = course(turn, errors)
-    (bend, grip), speed, gain = turn.grip, turn.state[PATH_SPEED], turn.gain
+    bend, grip = turn.grip
+    speed = turn.state[PATH_SPEED]
+    gain = turn.gain
     # Feed-forward helps along the path only; the rates of the body damp a slide.
     ahead = turn.control[0] * jnp.maximum(1.0 - jnp.abs(turned), 0.0)
     rates = gain[0, PATH_SPEED + 1 :] @ errors[PATH_SPEED + 1 :]
@@ -158,7 +170,8 @@ def recovering(
     most = CORNERING * held + 0.01
     wanted = jnp.clip(wanted, -most, most)
 
-    aside, radius = jnp.abs(errors[LATERAL]), CIRCLE * bend
+    aside = jnp.abs(errors[LATERAL])
+    radius = CIRCLE * bend
     slow = jnp.minimum(speed, jnp.sqrt(radius * grip))
     # Farther away there is room for a wider arc.
     wide = jnp.clip(jnp.sqrt(ARC * grip * aside + 1e-9), slow, speed)
@@ -241,8 +254,10 @@ def path_errors(
         point: x, y, yaw, speed of the reference.
         curvature: of the path at `point` [1/m].
     """
-    dx, dy = state[0] - point[0], state[1] - point[1]
-    c, s = jnp.cos(point[2]), jnp.sin(point[2])
+    dx = state[0] - point[0]
+    dy = state[1] - point[1]
+    c = jnp.cos(point[2])
+    s = jnp.sin(point[2])
     along = c * dx + s * dy
     # The path bends away from its tangent by κ/2 · along².
     lateral = c * dy - s * dx - 0.5 * curvature * along**2
@@ -298,7 +313,8 @@ class RecoveringFeedback(LinearFeedback):
     def __call__(self, errors: PathErrors, curvature: Scalar, speed: Scalar) -> Control:
         """Return u, without any limit of the actuators."""
         turn = self._turn(errors, curvature, speed)
-        (ahead, base), (lateral, heading, _) = turn.control, turn.gain[0]
+        ahead, base = turn.control
+        lateral, heading, _ = turn.gain[0]
         steering = ahead - lateral * errors.lateral - heading * errors.heading
         linear = jnp.stack([steering, base - self.speed_gain * errors.speed])
         steering, drive = recovering(

@@ -76,7 +76,8 @@ class PathLaw(NamedTuple):
                 counts as 0, since the tables are about driving forward.
             env: e.
         """
-        speed, sharpest = jnp.maximum(speed, 0.0), self.high[0]
+        speed = jnp.maximum(speed, 0.0)
+        sharpest = self.high[0]
         counts = self.control.shape[:-1]
         # Over v² κ: the limit of the tyres is the same at every speed of the table.
         at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
@@ -103,7 +104,8 @@ class PathLaw(NamedTuple):
 
     def _steerings(self, turns: slice, at: Array) -> Float[Array, " turn"]:
         """Return the steering of some of the tabled v² κ, at a speed and e."""
-        counts, table = self.control.shape[1:-1], self.control[turns, ..., 0]
+        counts = self.control.shape[1:-1]
+        table = self.control[turns, ..., 0]
         rows, weights = _corners(at, self.low[1:], self.high[1:], counts)
         return table.reshape(len(table), -1)[:, rows] @ weights
 
@@ -165,7 +167,8 @@ def textbook_law(
     else:
         lateral = 2.0 * wheelbase / (constant * speed) ** 2
         heading = constant * speed * lateral
-    gain, zero = law.gain, jnp.zeros_like(speed)
+    gain = law.gain
+    zero = jnp.zeros_like(speed)
     steering = [lateral, heading, *[zero] * (gain.shape[-1] - 2)]
     rows = jnp.stack(steering, -1).reshape(1, -1, *[1] * (axes - 2), gain.shape[-1])
     return law._replace(gain=gain.at[..., 0, :].set(rows))
@@ -215,10 +218,8 @@ def derive_path_law(
             the same shape at every speed, so that one metric serves all of them.
         drive: weight, per control unit².
     """
-    low, high = (
-        (-lateral_acceleration, speed[0], *env_low),
-        (lateral_acceleration, speed[1], *env_high),
-    )
+    low = (-lateral_acceleration, speed[0], *env_low)
+    high = (lateral_acceleration, speed[1], *env_high)
     counts = (*points[:2], *points[2:] * len(env_low))
     if (
         len(points) != 3
@@ -256,7 +257,8 @@ def _row(
     condition: Array,
 ) -> tuple[Array, Array, Array]:
     """Steady states, controls and gains over all v_ref² κ, at one (v_ref, e)."""
-    middle, curvatures = len(accelerations) // 2, accelerations / condition[0] ** 2
+    middle = len(accelerations) // 2
+    curvatures = accelerations / condition[0] ** 2
 
     def moved(kappa: Scalar) -> Callable[[Array], Array]:
         return lambda both: step(both[:size], both[size:], kappa, condition[1:])
@@ -341,7 +343,8 @@ def riccati_gain(
     """Return K of the Riccati recursion; 0 where it is not finite."""
     A, B = jnp.split(slopes, [slopes.shape[0]], axis=1)
     diagonal = jnp.zeros(A.shape[0]).at[: len(state_weights)]
-    Q, R = jnp.diag(diagonal.set(jnp.asarray(state_weights))), jnp.diag(control_weights)
+    Q = jnp.diag(diagonal.set(jnp.asarray(state_weights)))
+    R = jnp.diag(control_weights)
 
     def best(value: Array) -> Array:
         # R > 0 keeps the matrix invertible, also where a control has no effect.

@@ -96,7 +96,8 @@ class Evaluated(NamedTuple):
         # A rollout that is not finite keeps nothing, whatever its violation says.
         violations = jnp.where(jnp.isfinite(costs), self.violations, jnp.inf)
         kept = violations <= 0.0
-        any_kept, costs = jnp.any(kept), jnp.where(kept, costs, jnp.inf)
+        any_kept = jnp.any(kept)
+        costs = jnp.where(kept, costs, jnp.inf)
         return jnp.where(any_kept, costs, violations), any_kept
 
 
@@ -152,7 +153,8 @@ class Planner(Stateful):
 
     def __post_init__(self) -> None:
         check_intervals(self)
-        shape, std = self.task.low.shape, self.noise_std
+        shape = self.task.low.shape
+        std = self.noise_std
         if shape not in ((), (len(std),)):
             raise ValueError(f"noise_std needs a number a control, got {std}")
 
@@ -204,7 +206,8 @@ class Planner(Stateful):
         reference: Any,
     ) -> tuple[Control, PlannerState, ControllerInfo]:
         """Return the control of one step, the next state and `ControllerInfo`."""
-        task, tuning = self.task, state.tuning
+        task = self.task
+        tuning = state.tuning
         precise = task.check(observation, env, reference, self.horizon)
         # What is not finite must be noticed even where neither model nor cost reads it.
         clean = all_finite((observation, env, reference))
@@ -227,7 +230,8 @@ class Planner(Stateful):
         result = self.search(search_key, before, tuning, evaluate)
 
         # The chosen plan is new (a mean): its cost is known from its rollout.
-        plans, chosen = result.plan[:, None], 0
+        plans = result.plan[:, None]
+        chosen = 0
         if task.constraint is not None and result.best is not None:
             # The mean of plans that pass an obstacle on both sides hits it: the best
             # single candidate replaces it where that violates less.
@@ -273,7 +277,9 @@ class Planner(Stateful):
 
     def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
         """Roll out all plans, as many at a time as the memory holds."""
-        task, start, targets = self.task, setup.start, setup.targets
+        task = self.task
+        start = setup.start
+        targets = setup.targets
         numbers = jnp.arange(self.horizon)
         places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
 
@@ -286,7 +292,9 @@ class Planner(Stateful):
         axis, along_steps = (-1, -1) if short else (0, 1)
 
         def judge(before: Any, after: Any, target: Any, at: StepIndex) -> Any:
-            cost, worst, seen = after.cost, None, (after.state, after.control)
+            cost = after.cost
+            worst = None
+            seen = (after.state, after.control)
             if task.cost is not None:
                 pair = before._replace(latent=()), Sample((), *seen)
                 cost = task.cost(tuning.cost, *pair, target, at)
@@ -331,7 +339,8 @@ class Planner(Stateful):
             lambda leaf: jnp.swapaxes(leaf, 0, 1),
             in_batches(together, jnp.swapaxes(plans, 0, 1), size=size),
         )
-        worst, ones = along.violations, jnp.ones(self.horizon, along.costs.dtype)
+        worst = along.violations
+        ones = jnp.ones(self.horizon, along.costs.dtype)
         # A product: a sum would be one loop with the costs that it is over. In full
         # precision: accelerators round factors to ten bits.
         exact = jax.lax.Precision.HIGHEST
@@ -383,7 +392,8 @@ def tuned(state: Memory, **changes: Any) -> Memory:
     def change(node: Any) -> Any:
         if not is_planner(node):
             return node
-        before, wanted = node.tuning, dict(changes)
+        before = node.tuning
+        wanted = dict(changes)
         if isinstance(before.cost, dict):
             # Weights that are not named keep their values.
             wanted["cost"] = before.cost | changes.get("cost", {})
@@ -398,7 +408,8 @@ def shift(plans: Any, elapsed: Scalar) -> Any:
     steps = jnp.arange(len(jax.tree.leaves(plans)[0]), dtype=elapsed.dtype)
     times = jnp.clip(steps + elapsed, 0, len(steps) - 1)
     whole = jnp.floor(times)
-    index, share = whole.astype(int), (times - whole)[:, None]
+    index = whole.astype(int)
+    share = (times - whole)[:, None]
     after = jnp.minimum(index + 1, len(steps) - 1)
     return jax.tree.map(lambda p: p[index] + share * (p[after] - p[index]), plans)
 

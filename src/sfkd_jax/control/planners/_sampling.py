@@ -36,7 +36,9 @@ from sfkd_jax.types import Control, Key, Scalar
 DEVICES = "samples"
 """Axis of a mesh of devices."""
 KINDS = ("ar1", "white", "spline")
-BISECTIONS, DECADES = 24, (-12.0, 4.0)
+BISECTIONS = 24
+"""Steps of the search for a temperature."""
+DECADES = (-12.0, 4.0)
 """The temperature is searched between 10^-12 and 10^4 times the range of the costs. The
 lower end is that small because a single outlier widens the range.
 """
@@ -88,7 +90,8 @@ class SamplingPlanner(Planner):
             factor = autoregression(self.horizon, rho)
         # A product for white noise too: without one, XLA draws numbers one by one where
         # they are scaled. In full precision: accelerators round factors to ten bits.
-        table, exact = jnp.asarray(factor, dtype=float), jax.lax.Precision.HIGHEST
+        table = jnp.asarray(factor, dtype=float)
+        exact = jax.lax.Precision.HIGHEST
         noise = jnp.einsum("tk,kmc->tmc", table, white, precision=exact)
         return noise * std[None, None]
 

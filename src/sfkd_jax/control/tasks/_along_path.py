@@ -290,7 +290,8 @@ def requesting(planner: Controller, horizon: int, coordinates: int) -> Controlle
     def act(
         params: Params, state: Request, xi: PathState, env: Any, preview: Preview
     ) -> tuple[Control, Request, ControllerInfo]:
-        bend, along = preview.road[0, 0], preview.along
+        bend = preview.road[0, 0]
+        along = preview.along
         left = xi[LATERAL] + 0.5 * bend * along**2
         motion = jnp.stack([along, left, xi[HEADING] + bend * along])
         pose = compose(state.reference[0, POSE], motion)

@@ -111,7 +111,8 @@ def tracking_cost(
     }
 
     def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
-        errors, before = inputs.errors, inputs.errors_before
+        errors = inputs.errors
+        before = inputs.errors_before
         # Finite at standstill.
         travelled = jnp.maximum(inputs.speed, CREEP) * dt + 1e-3
         angle = (errors.lateral - before.lateral) / travelled
@@ -196,7 +197,8 @@ class LawTask:
 
     def box(self) -> tuple[Control, Control]:
         """Return the lower and upper control limits."""
-        low, high = self.control_low, self.control_high
+        low = self.control_low
+        high = self.control_high
         return jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
 
     @cached_property
@@ -258,7 +260,8 @@ class PathTracking(LawTask):
         at: StepIndex,
     ) -> StepResult:
         """Return one step of one rollout: law, perturbation, limits, model."""
-        model, speed = self.model, target.now.point[3]
+        model = self.model
+        speed = target.now.point[3]
         law_control, authority = self._law_control(before.state, target.now)
         nu = admitted(nu, before.state[3], speed, authority)
         control = self.limit(law_control + nu, before.control)
@@ -282,8 +285,11 @@ class PathTracking(LawTask):
         beyond the limits. After a far-off observation that is thousands of radians, and
         it would stay in the plan when the observations are right again.
         """
-        point, curvature, law = target.point, target.curvature, self.law
-        errors, authority = path_errors(state, point, curvature), jnp.ones(())
+        point = target.point
+        curvature = target.curvature
+        law = self.law
+        errors = path_errors(state, point, curvature)
+        authority = jnp.ones(())
         control = law(errors, curvature, point[3])
         if isinstance(law, RecoveringFeedback):
             authority = law.authority(errors, point[3])

@@ -150,7 +150,8 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
         bottom, top, most = ends
         # An actuator outside its box returns to it at once, whatever its slew limit.
         before = jnp.clip(before, bottom, top)
-        low, high = before - most, before + most
+        low = before - most
+        high = before + most
         return jnp.clip(wanted, jnp.maximum(bottom, low), jnp.minimum(top, high))
 
     def limit(wanted: Control, before: Control) -> Control:
@@ -208,11 +209,10 @@ def outside_boxes(
         margin: by which each is enlarged, with round corners [m].
     """
     away = position - boxes[:, :2]
-    cos, sin = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
-    along, left = (
-        cos * away[:, 0] + sin * away[:, 1],
-        cos * away[:, 1] - sin * away[:, 0],
-    )
+    cos = jnp.cos(boxes[:, 2])
+    sin = jnp.sin(boxes[:, 2])
+    along = cos * away[:, 0] + sin * away[:, 1]
+    left = cos * away[:, 1] - sin * away[:, 0]
     return margin - outside_box(along, left, (0.5 * boxes[:, 3], 0.5 * boxes[:, 4]))
 
 

@@ -139,7 +139,8 @@ class Adaptation(Stateful):
     model_error: tuple[Positive, ...] = (1e-3, 3e-4, 3e-3, 3e-3, 1.5e-3, 5e-4)
 
     def __post_init__(self) -> None:
-        low, high = self.env_low, self.env_high
+        low = self.env_low
+        high = self.env_high
         if not self.model.along_path:
             raise ValueError("adaptation needs a model in path coordinates")
         symmetric = len(low) == len(high) == 2 and -low[WIND] == high[WIND] > 0
@@ -194,10 +195,13 @@ class Adaptation(Stateful):
         preview: Preview,
     ) -> tuple[Control, AdaptiveState, ControllerInfo]:
         """Take one control step."""
-        estimator, before = self._estimator, state.belief
-        loop, size = estimator.loop, coordinates.shape[0]
+        estimator = self._estimator
+        before = state.belief
+        loop = estimator.loop
+        size = coordinates.shape[0]
         params = fold(self.model, params)
-        env, road = self._inside(env), preview.road[0]
+        env = self._inside(env)
+        road = preview.road[0]
         # Nothing is learned from what the gate did not believe, nor at another rate.
         usable = jnp.all(preview.measured) & preview.on_time
         belief, rejected = estimator.follow(params, before, coordinates, usable)
@@ -239,7 +243,8 @@ class Adaptation(Stateful):
             noise, error = self._noise
             low = jnp.asarray(self.env_low, dtype=float)
             high = jnp.asarray(self.env_high, dtype=float)
-            frictions, chain = jnp.full(1, jnp.nan, dtype=float), jnp.ones((1, 1))
+            frictions = jnp.full(1, jnp.nan, dtype=float)
+            chain = jnp.ones((1, 1))
             if self.estimate_env:
                 ends = self.env_low[FRICTION], self.env_high[FRICTION]
                 points = self.friction_points
@@ -260,7 +265,8 @@ class Adaptation(Stateful):
 
     def _inside(self, env: Environment) -> Environment:
         """e in its box; the middle of it if e is estimated."""
-        low, high = jnp.asarray(self.env_low), jnp.asarray(self.env_high)
+        low = jnp.asarray(self.env_low)
+        high = jnp.asarray(self.env_high)
         return 0.5 * (low + high) if self.estimate_env else jnp.clip(env, low, high)
 
 
@@ -281,7 +287,8 @@ def _compensation(
     only its steering is used. A and B are the derivatives of one step of the loop; e
     has the force inside E, `excess` is what lies beyond, relative to the largest in E.
     """
-    model, size = loop.model, coordinates.shape[0]
+    model = loop.model
+    size = coordinates.shape[0]
     fiber = model.fiber(params, env)
     law_control = loop.law(coordinates, road[0], road[1], env)
     applied = Applied(law_control, road, env)

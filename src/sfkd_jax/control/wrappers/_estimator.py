@@ -21,8 +21,10 @@ from sfkd_jax.control.wrappers._innovations import expected_coordinates
 from sfkd_jax.geometry import PathState
 from sfkd_jax.types import Control, Environment, Model, Params, Scalar
 
-FRICTION, WIND = 0, 1
-"""Entries of e."""
+FRICTION = 0
+"""Entry of e that is the friction."""
+WIND = 1
+"""Entry of e that is the wind."""
 FORCE, STEERING, DRIVE, TURN_STEERING, TURN_FORCE = range(5)
 """Entries of the causes: the last two are in proportion to κ."""
 CAUSES = 5
@@ -94,7 +96,8 @@ def corrected(
         The bank, and False if every filter is farther away than `OUTLIER` or is not
         finite.
     """
-    means, covariances = bank.means, bank.covariances
+    means = bank.means
+    covariances = bank.covariances
     identity = jnp.eye(means.shape[1])
     fit = jnp.zeros(means.shape[0])
     surprise = jnp.zeros(means.shape[0])
@@ -189,7 +192,8 @@ class Loop(NamedTuple):
         self, params: Params, applied: Applied, xi: PathState
     ) -> PathState:
         """Return ξ one step later; the model takes ν = u − law(ξ; κ, v_ref, e)."""
-        road, env = applied.road, applied.env
+        road = applied.road
+        env = applied.env
         nu = applied.control - self.law(xi, road[0], road[1], env)
         fiber = self.model.fiber(params, env)
         return expected_coordinates(self.model, fiber, xi, nu, road)
@@ -221,7 +225,8 @@ class Loop(NamedTuple):
         The force acts as wind within E and along `force_slope` beyond it; the e of
         `applied` is that without the causes.
         """
-        at, road = xi.shape[0], applied.road
+        at = xi.shape[0]
+        road = applied.road
         env, excess = self.split_force(applied.env, side_force(causes, road))
         applied = applied._replace(env=env)
         slope = self.force_slope(params, applied, xi)
@@ -296,17 +301,20 @@ class Estimator:
         A force that could be noise is thereby left alone (James-Stein).
         """
         size = self.sensors.shape[0]
-        causes, variance = belief.bank.mean()[size:], belief.bank.variance()[size:]
+        causes = belief.bank.mean()[size:]
+        variance = belief.bank.variance()[size:]
         kept = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
         return causes.at[FORCE].multiply(jnp.maximum(kept, 0.0))
 
     def _advanced(self, params: Params, belief: Belief) -> Bank:
         """The bank one step later, without a measurement."""
-        bank, size = mixed(belief.bank, self.transition), self.sensors.shape[0]
+        bank = mixed(belief.bank, self.transition)
+        size = self.sensors.shape[0]
 
         def one(mean: Array, friction: Array) -> tuple[Array, Array]:
             given = _assuming(belief.applied, friction)
-            xi, causes = mean[:size], mean[size:]
+            xi = mean[:size]
+            causes = mean[size:]
             after, slope = self.loop.predicted(params, given, xi, causes)
             return jnp.concatenate([after, causes]), slope
 
@@ -331,7 +339,8 @@ class Estimator:
         self, params: Params, belief: Belief, expected: Bank, measured: PathState
     ) -> Float[Array, " 2"]:
         """The scores after one more prediction."""
-        size, mean = measured.shape[0], belief.bank.mean()
+        size = measured.shape[0]
+        mean = belief.bank.mean()
         applied = _assuming(belief.applied, expected.probabilities @ self.frictions)
         nothing = jnp.zeros_like(mean[size:])
         alone, _ = self.loop.predicted(params, applied, mean[:size], nothing)

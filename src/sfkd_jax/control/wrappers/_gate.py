@@ -224,8 +224,11 @@ class Gate(Stateful):
         preview = preview._replace(road=road, on_time=on_time)
 
         xi, measured, lost, after = self._believed(state, coordinates, preview, periods)
-        clean, compared = jnp.all(measured), all_finite(state.expected)
-        tested, statistic, alarm = None, jnp.asarray(jnp.nan), jnp.asarray(False)
+        clean = jnp.all(measured)
+        compared = all_finite(state.expected)
+        tested = None
+        statistic = jnp.asarray(jnp.nan)
+        alarm = jnp.asarray(False)
         if self.test is not None and state.test is not None:
             used = measured & clean & on_time
             tested, statistic = self.test.update(state.test, coordinates, used)
@@ -286,7 +289,8 @@ class Gate(Stateful):
             ξ, measured where that is believed; where it is; whether there has been
             nothing to believe for too long; the state with what follows from that.
         """
-        expected, compared = state.expected, all_finite(state.expected)
+        expected = state.expected
+        compared = all_finite(state.expected)
         innovation = _difference(coordinates, expected)
         limit = self._limit(state, periods, preview.on_time)
         grown = limit * (1.0 + self.growth * state.missing)
@@ -350,7 +354,8 @@ class Gate(Stateful):
             What it differs by from the estimate of that step, NaN if none was there;
             what the estimate of now then differs by; the past, corrected by it.
         """
-        past, bends = state.past[:, :-1], state.past[:, -1]
+        past = state.past[:, :-1]
+        bends = state.past[:, -1]
         steps = self.dt * past[:, PATH_SPEED]
         behind = jnp.cumsum(steps)
         miss = jnp.nan_to_num(jnp.abs(behind + gap), nan=jnp.inf)
@@ -406,7 +411,8 @@ class Gate(Stateful):
     ) -> tuple[PathState, Bool[Array, ""], InnovationState | None]:
         """ξ̂ one step later, whether the model says so, and what ξ is compared with."""
         control, road, env = applied
-        nearest, box = self.conditions.nearest(env), self.conditions.state
+        nearest = self.conditions.nearest(env)
+        box = self.conditions.state
         turn = self.law.turn(road[0], road[1], nearest)
         fiber = box and self.model.fiber(fold(self.model, params), nearest)
 

@@ -226,7 +226,8 @@ class Shield(Stateful):
                 "a shield needs a model in path coordinates: model.frame=path"
             )
         check_intervals(self)
-        states, environments = self.law.gain.shape[-1], len(self.law.low) - 2
+        states = self.law.gain.shape[-1]
+        environments = len(self.law.low) - 2
         _check_box("control", self.control, 2)
         _check_box("env", self.conditions.env, environments)
         _check_box("state", self.conditions.state, states)
@@ -234,7 +235,8 @@ class Shield(Stateful):
 
     def init(self, key: Key) -> ShieldState:
         """Return the state before the first control step."""
-        states, environments = self.law.gain.shape[-1], len(self.law.low) - 2
+        states = self.law.gain.shape[-1]
+        environments = len(self.law.low) - 2
 
         def encode(params: Params) -> Latent:
             fiber = self.model.fiber(params, jnp.zeros(environments))
@@ -264,7 +266,8 @@ class Shield(Stateful):
         planned, inner, info = self.inner.act(
             params, state.inner, coordinates, env, preview
         )
-        road, nearest = self._road(preview), self.conditions.nearest(env)
+        road = self._road(preview)
+        nearest = self.conditions.nearest(env)
         turn = self.law.turn(road[0, 0], road[0, 1], nearest)
         law_control = turn.feedback(coordinates)
         now, fiber, flags = self._compare(
@@ -334,7 +337,8 @@ class Shield(Stateful):
 
     def _slow(self, xi: PathState, road: Float[Array, " 2"]) -> Bool[Array, ""]:
         """Whether the car or its reference is slower than the conditions."""
-        state, given = self.conditions.state, self.conditions.road
+        state = self.conditions.state
+        given = self.conditions.road
         slow = xi[PATH_SPEED] < (-jnp.inf if state is None else state[0][PATH_SPEED])
         return slow if given is None else slow | (road[1] < given[0][1])
 
@@ -367,7 +371,8 @@ class Shield(Stateful):
             The nominal model in the fibre of the current environment, at the measured
             ξ if it starts anew; the fibre; entries of `info`.
         """
-        model, road = self.model, preview.road[0]
+        model = self.model
+        road = preview.road[0]
         inside = self.conditions.nearest(env)
         folded = fold(model, params)
         fiber = model.fiber(folded, inside)

@@ -38,7 +38,8 @@ class SharedWeights(NamedTuple):
     @property
     def ends(self) -> tuple[list[int], list[int]]:
         """Where the layers end in both tables of `PerEnvironment`."""
-        decoder, rank = self.decoder.matrices, self.readout.shape[1]
+        decoder = self.decoder.matrices
+        rank = self.readout.shape[1]
         hidden = (*self.residual.matrices[:-1], *decoder[:-1])
         return list(accumulate(map(len, hidden))), [rank, rank + 3 * bool(decoder)]
 
@@ -170,7 +171,8 @@ class Learned(nn.Module):
                 self.operators, self.couplings, self.residual_weights(1.0), self.rate()
             )
         else:
-            vertices, residual = separate_budget(self.operators, self.rho), Weights()
+            vertices = separate_budget(self.operators, self.rho)
+            residual = Weights()
             if self.kind is not None:
                 residual = self.residual_weights(self.beta)
         # Norm at most 1 in scaled units: a ball in z bounds the body state.

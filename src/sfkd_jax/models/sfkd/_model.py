@@ -129,7 +129,8 @@ class LatentModel:
     def fiber(self, params: Params, env: Environment) -> SfkdFiber:
         """Return all that depends on e, for many steps in it."""
         fiber = self._fiber(params, env)
-        local, A = fiber.local, cast(Mixture, fiber.A)
+        local = fiber.local
+        A = cast(Mixture, fiber.A)
         # For controls as they are: a rollout then scales none of its own.
         gains = tuple(gain / self.space.control_scale for gain in local.gains)
         offsets = _moved(gains, local.offsets, -self.space.control_mean)
@@ -187,7 +188,8 @@ class LatentModel:
         if not shared.decoder.matrices:
             return PosedLatent(latent.pose, z)
         # From z before the step: the motion during the period starts there.
-        space, motion = self.space, apply(shared.decoder.matrices, decoder, latent.z)
+        space = self.space
+        motion = apply(shared.decoder.matrices, decoder, latent.z)
         # Mean plus scale: an output of 0 is the average motion of the data.
         motion = space.increment_mean + space.increment_scale * motion
         return PosedLatent(compose(latent.pose, motion), z)
@@ -208,7 +210,8 @@ class LatentModel:
         """`_terms` from the biases of every layer."""
         *biases, forcing = hidden
         direct, motion, logits = outer
-        inner, A = max(len(fiber.shared.residual.matrices) - 1, 0), fiber.A
+        inner = max(len(fiber.shared.residual.matrices) - 1, 0)
+        A = fiber.A
         # Decided by the shape of the weights, that is, when the program is traced.
         if fiber.shared.forcing:
             direct += fiber.shared.forcing[0] @ jnp.tanh(forcing)
@@ -235,7 +238,8 @@ class LatentModel:
 
     def explicit(self, params: Params) -> Explicit:
         """Return the weights that a certificate is about."""
-        shared, learned = self.shared(params), self.learned
+        shared = self.shared(params)
+        learned = self.learned
         decoder = shared.decoder.matrices
         if learned.pose:
             # In physical units, so that a certificate needs no scales of the model.
@@ -422,7 +426,8 @@ def rotate_planes(
     first, second = jnp.split(z, 2)
     # Rational in t: no trigonometry, and c² + s² = 1 up to rounding.
     scale = 1.0 / (1.0 + tangents**2)
-    cosine, sine = (1.0 - tangents**2) * scale, 2.0 * tangents * scale
+    cosine = (1.0 - tangents**2) * scale
+    sine = 2.0 * tangents * scale
     return jnp.concatenate(
         [cosine * first - sine * second, sine * first + cosine * second]
     )
