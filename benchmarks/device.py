@@ -28,15 +28,18 @@ FEW, AUTO = 300, (jax.sharding.AxisType.Auto,)
 DEFAULTS = dict(samples=[1500], steps=200, episodes=16, planners=0, seed=2026)
 HORIZON, SETTLED, PERIOD = 20, 20, 0.1
 """Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
-PLANNERS = {"law alone": {"num_samples": 1}}
+PLANNERS = {
+    "law alone": {"num_samples": 1},
+    "MPPI, 16 samples": {"num_samples": 16},
+    "MPPI, 300 samples": {"num_samples": 300},
+    "MPPI, 1500 samples": {"num_samples": 1500},
+    "MPPI, 16 samples, no shrinkage": {"num_samples": 16, "shrinkage": False},
+    "MPPI, 1500 samples, no shrinkage": {"num_samples": 1500, "shrinkage": False},
+    "CEM, 3 × 500 samples": {"planner": "cem", "num_samples": 500, "elites": 50},
+    "gradient, 1 iteration": {"planner": "gradient", "iterations": 1},
+    "gradient, 5 iterations": {"planner": "gradient", "iterations": 5},
+}
 """What differs from the shipped planner."""
-for n in (16, 300, 1500):
-    PLANNERS[f"MPPI, {n}"] = {"num_samples": n}
-for n in (16, 1500):
-    PLANNERS[f"{n}, no shrinkage"] = {"num_samples": n, "shrinkage": False}
-PLANNERS["CEM, 3×500"] = {"planner": "cem", "num_samples": 500, "elites": 50}
-for n in (1, 5):
-    PLANNERS[f"gradient, {n}"] = {"planner": "gradient", "iterations": n}
 ROADS = {"dynamic": "s3", "kinematic": "s2"}
 """Scenarios on which planners are compared."""
 

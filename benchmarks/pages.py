@@ -5,17 +5,18 @@ python -m benchmarks.pages    writes every block `<!-- NAME -->` … `<!-- end -
 
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks import PRETRAINED, ROOT, is_old
+from benchmarks.tables import Measured, measured, table
 from experiments import results
-from experiments.results import markdown as table
 from experiments.simulator import PREFIXES
+from sfkd_jax import store
 
-ROOT = Path(__file__).parents[1]
-PRETRAINED = ROOT / "src" / "sfkd_jax" / "pretrained"
 CARS = ("dynamic", "kinematic")
+NONE = "–"
+"""What a table says where nothing was measured."""
 
 
 def filled(page, made):
@@ -38,277 +39,517 @@ def read(name):
     return json.loads((ROOT / name).read_text("utf-8"))
 
 
-LAWS = ("law", "law_plant", "law_nominal")
-"""The law that ships, and those of the true car and of the textbook bicycle."""
+def captioned(parts):
+    """Several tables in one block: caption -> table."""
+    return "\n\n".join(f"**{caption}**\n\n{made}" for caption, made in parts.items())
+
+
+def policy_of(car):
+    """The policy along a path that ships for a car."""
+    return f"{car}_path"
+
+
+def by_car(text, found):
+    """The entries of a row that has a column a car: car -> its committed row."""
+    return [
+        measured(text(found[car]), found[car], policy=policy_of(car)) for car in CARS
+    ]
+
+
+# ---- the corridor
+
+
+def claims():
+    """What is claimed of every car's corridor: a list of (numbers by name, whether old).
+
+    The shipped policies come first, whose certificates are bound to the weights, and then
+    the car of highway-env.
+    """
+    found = []
+    for car in CARS:
+        folder = PRETRAINED / policy_of(car)
+        certificate = read(folder / "certificate.json")
+        _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
+        about = certificate["corridor"]
+        numbers = {
+            "corridor_m": about["corridor_m"],
+            "coverage": about["coverage"],
+            "coverage_ci95": about["coverage_ci95"],
+            "coverage_s3": about["by_scenario"]["s3"]["coverage"],
+            "alpha": certificate["outputs"]["position"]["alpha"],
+        }
+        for group, counted in about["by_group"].items():
+            numbers[f"coverage_{group}"] = counted["coverage"]
+        old = certificate["policy_sha256"] != manifest["content_sha256"]
+        found.append((numbers, old))
+    foreign = read("experiments/simulator.json")
+    found.append((foreign, is_old(foreign)))
+    for numbers, _ in found:
+        numbers["lower"], numbers["upper"] = numbers["coverage_ci95"]
+    return found
+
+
+def claimed(lines):
+    """Lines with a column a car, from (name of the line, name of the number, format)."""
+    columns = claims()
+    return [
+        [
+            name,
+            *(
+                Measured(form.format(numbers[number]), old)
+                if number in numbers
+                else NONE
+                for numbers, old in columns
+            ),
+        ]
+        for name, number, form in lines
+    ]
+
+
+RIVALS = {
+    "sfkd": "this policy",
+    "oracle": "a planner that knows the true car",
+    "nominal": "MPPI with the textbook bicycle",
+    "law_stanley": "Stanley's law",
+    "law": "the law alone",
+}
+"""Row of corridor.json -> who drives, on the first page."""
+FOREIGN = {"sfkd": ""} | PREFIXES
+"""Row of corridor.json -> prefix of the same in simulator.json."""
 
 
 def corridor():
-    """The certificates of the shipped policies and of a foreign car, and how they drive."""
-    certificates = [read(PRETRAINED / f"{car}_path/certificate.json") for car in CARS]
-    rows = read("experiments/corridor.json")["rows"]
-    rows = [row for row in rows if row["scenario"] == "s3"]
-
-    def error(car, system, digits=1):
-        row = next(r for r in rows if (r["vehicle"], r["row"]) == (car, system))
-        if row["left_the_lane"]:
-            return "leaves the lane"
-        return f"{np.mean(row['rmse_mm']):.{digits}f}"
-
-    other = read("experiments/simulator.json")
-    about = [*(document["corridor"] for document in certificates), other]
-    rates = (one["outputs"]["position"]["alpha"] for one in certificates)
-    inside = ((one["coverage"], *one["coverage_ci95"]) for one in about)
-    lines = [
+    """The first page: corridors of two shipped policies and of a foreign car; S3."""
+    lines = claimed(
         [
-            "**corridor: bound on the distance from the path [m]**",
-            *(f"**{one['corridor_m']:.3f}**" for one in about),
-        ],
-        [
-            "share of fresh runs inside, with its 95 % interval",
-            *("{:.3f} ({:.3f} to {:.3f})".format(*one) for one in inside),
-        ],
-        [
-            "share of S3 runs inside, never calibrated on",
-            *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about[:-1]),
-            f"{other['coverage_s3']:.3f}",
-        ],
-        [
-            "contraction rate, proved (metric of the distance)",
-            *(f"{rate:.3f}" for rate in [*rates, other["alpha"]]),
-        ],
-        [
-            "S3, lateral RMSE [mm]; of a planner that knows the car",
-            *(f"{error(car, 'sfkd')}; {error(car, 'oracle')}" for car in CARS),
-            f"{other['rmse_mm']:.1f}; –",
-        ],
-        [
-            "the same: MPPI with the textbook bicycle; Stanley; pure pursuit",
-            *("; ".join(error(car, name, 0) for name in PREFIXES) for car in CARS),
-            "; ".join(f"{other[f'{name}rmse_mm']:.0f}" for name in PREFIXES.values()),
-        ],
-        [
-            "the law alone: of the learned model; of the true car; of the bicycle [mm]",
-            *("; ".join(error(car, law) for law in LAWS) for car in CARS),
-            "–",
-        ],
-    ]
+            ("corridor half width [m]", "corridor_m", "{:.3f}"),
+            ("share of fresh runs inside", "coverage", "{:.2f}"),
+            ("contraction rate (proved)", "alpha", "{:.2f}"),
+        ]
+    )
+    foreign = read("experiments/simulator.json")
+    driven = {
+        (row["vehicle"], row["row"]): row
+        for row in read("experiments/corridor.json")["rows"]
+        if row["scenario"] == "s3"
+    }
+    for system, name in RIVALS.items():
+        rows = {car: driven[car, system] for car in CARS}
+        line = [f"S3, lateral RMSE of {name} [mm]", *by_car(mean_error, rows)]
+        if system in FOREIGN:
+            prefix = FOREIGN[system]
+            error = foreign[f"{prefix}rmse_mm"]
+            departures = foreign[f"{prefix}departures"]
+            line.append(measured(in_millimetres(error, departures), foreign))
+        else:
+            line.append(NONE)
+        lines.append(line)
     return table(["", *CARS, "[highway-env](docs/your-vehicle.md)"], lines)
 
 
-def measured():
+def mean_error(row):
+    """Mean over the runs of a row of corridor.json."""
+    return in_millimetres(np.mean(row["rmse_mm"]), row["left_the_lane"])
+
+
+def in_millimetres(error, left_the_lane):
+    """An error as people read it, or how many runs left the lane."""
+    if left_the_lane:
+        return f"{left_the_lane} runs leave the lane"
+    return f"{error:.1f}" if error < 20.0 else f"{error:.0f}"
+
+
+def wide():
+    """What the certificates claim, and the same of the foreign car."""
+    inside = "share of fresh runs inside"
+    lines = claimed(
+        [
+            ("corridor half width [m]", "corridor_m", "{:.3f}"),
+            (f"{inside}, worst group of drives", "coverage", "{:.3f}"),
+            ("lower end of its 95 % interval", "lower", "{:.3f}"),
+            ("upper end of its 95 % interval", "upper", "{:.3f}"),
+            (f"{inside}: bends", "coverage_bends", "{:.3f}"),
+            (f"{inside}: changing speeds", "coverage_speeds", "{:.3f}"),
+            (f"{inside}: lane changes", "coverage_lane_changes", "{:.3f}"),
+            ("share of S3 runs inside, never calibrated on", "coverage_s3", "{:.3f}"),
+            ("contraction rate (proved)", "alpha", "{:.3f}"),
+        ]
+    )
+    return table(["", *CARS, "[highway-env](your-vehicle.md)"], lines)
+
+
+# ---- outside the box
+
+
+def recovery_rows():
     """What `benchmarks.recovery` found: (car, row) -> numbers."""
     rows = read("benchmarks/recovery.json")["rows"]
     return {(row["car"], row["row"]): row for row in rows}
 
 
+HOSTILE = {
+    "worst": "pushes outwards with the whole ν",
+    "bang-bang": "switches ν between its limits",
+    "random": "draws a limit of ν at every step",
+    "NaN": "asks for NaN",
+    "full lock": "asks for full lock",
+}
+"""Row of recovery.json -> what a hostile planner does."""
+
+
 def shield():
-    """Hostile planners inside the filter, and without it."""
-    rows = measured()
-
-    def cells(car, kind):
-        kept = rows[car, f"planner {kind}: guard"]
-        free = rows[car, f"planner {kind}: bare"]["left_the_lane"]
-        return [
-            f"{free} of {kept['runs']} → {kept['left_the_lane']}",
-            f"{kept['largest_m']:.3f} m, {100 * kept['inside']:.1f} %",
-        ]
-
-    head, inside = ["planner"], "largest distance, runs inside"
+    """Hostile planners inside the shield, and without it."""
+    found = recovery_rows()
+    lines = []
     for car in CARS:
-        head += [f"{car}: left the lane, without → with", inside]
-    kinds = ("worst", "bang-bang", "random", "NaN", "full lock")
-    return table(
-        head,
-        [[kind, *cells("dynamic", kind), *cells("kinematic", kind)] for kind in kinds],
-    )
+        for kind, does in HOSTILE.items():
+            kept = found[car, f"planner {kind}: guard"]
+            free = found[car, f"planner {kind}: bare"]
+            numbers = [
+                (str(kept["runs"]), kept),
+                (str(free["left_the_lane"]), free),
+                (str(kept["left_the_lane"]), kept),
+                (f"{kept['largest_m']:.3f}", kept),
+                (f"{100 * kept['inside']:.1f}", kept),
+            ]
+            cells = (measured(*one, policy=policy_of(car)) for one in numbers)
+            lines.append([f"{car}: {does}", *cells])
+    heads = [
+        "planner",
+        "runs",
+        "leave the lane without the shield",
+        "leave the lane with it",
+        "largest distance with it [m]",
+        "stay in the corridor with it [%]",
+    ]
+    return table(heads, lines)
 
 
 def recovery():
-    """Starts, wrong measurements and stops outside the box."""
-    rows = measured()
-
-    def starts(car, name):
-        new, old = (
-            rows[car, f"{name}: {way}"]
-            for way in ("planner in the guard", "law of the box")
-        )
-        return f"{old['back']} → {new['back']} of {new['runs']}"
-
-    def faults(car, length, *kinds):
-        found = [rows[car, f"{kind}, {length}"] for kind in kinds]
-        gone, runs, back = (
-            sum(row[name] for row in found) for name in ("departures", "runs", "back")
-        )
-        largest = max(row["largest_m"] or np.inf for row in found)
-        return f"{largest:.2f} m; {gone} of {runs}; {back}"
-
-    def stop(car, friction):
-        kept, bare = (
-            rows[car, f"brake, friction {friction}: {way}"] for way in ("guard", "bare")
-        )
-        return f"{kept['longest_m']:.1f}; {bare['longest_m']:.1f}"
-
-    def beyond(car):
-        # What no sensor contradicts, and what claims nothing.
-        unseen = ("position bias", "drift", "yaw bias", ": bare")
-        counted = [
-            row
-            for (whose, name), row in rows.items()
-            if whose == car and "steps" in row and not any(w in name for w in unseen)
-        ]
-        counts = (sum(row[n] for row in counted) for n in ("beyond_claim", "steps"))
-        return "{:,} of {:,}".format(*counts)
-
-    def flagged(car):
-        row = rows[car, "class"]
-        return f"{row['runs_not_healthy']} of {row['runs']}; {1 - row['healthy']:.2%}"
-
-    def found(car, way):
-        row = rows[car, f"steering offset 1.0 degrees, {way}"]
-        return f"{row['within_3s']:.1%}; {row['s_99'] or '–'} s"
-
-    jumps, silent = ("jump", "alternating", "yaw"), ("frozen", "late", "lost")
-    brief = faults, "brief"
-    cells = {
-        "starts that come back, law of the box alone → policy": (starts, "grid"),
-        "the same, random to 20 m, any yaw, S3 roads": (starts, "random starts"),
-        "pose jumps to 2 s: largest distance; departures; back": (*brief, *jumps),
-        "frozen, late, lost to 2 s": (*brief, *silent),
-        "either, for 5 s": (faults, "5 s", *jumps, *silent),
-        "full braking from 10 m/s, friction 0.7 [m]; unfiltered": (stop, 0.7),
-        "the same, friction 0.3": (stop, 0.3),
-        "steering 1° off: found in 3 s; 99 % found after": (found, "law"),
-        "the same, ν of the class": (found, "class"),
-        "steps beyond the distance that `info` claims": (beyond,),
-        "runs under the conditions with a flag; steps": (flagged,),
+    """Starts, wrong measurements, stops and alarms outside the box."""
+    found = recovery_rows()
+    tables = {
+        "Starts outside the box: how many of 420 runs are back after 20 s": starts,
+        "Wrong measurements on S3, 180 runs a row and car": faults,
+        "Full braking from 10 m/s: the longest way to a stand [m]": stops,
+        "A steering angle that is 1° off from some moment on": detection,
+        "What `info` says": alarms,
     }
+    return captioned({caption: made(found) for caption, made in tables.items()})
+
+
+def starts(found):
+    """Who comes back to the path."""
+    places = {
+        "grid": "grid beside a straight road, to 20 m and any heading",
+        "random starts": "at random beside an S3 road, to 20 m and any heading",
+    }
+    drivers = {
+        "law of the box": "the law of the box alone",
+        "planner in the guard": "the policy",
+    }
+    lines = []
+    for place, where in places.items():
+        for driver, who in drivers.items():
+            rows = {car: found[car, f"{place}: {driver}"] for car in CARS}
+            assert {row["runs"] for row in rows.values()} == {420}
+            lines.append([f"{where}: {who}", *by_car(lambda of: str(of["back"]), rows)])
+    return table(["start", *CARS], lines)
+
+
+POSE = "jump", "alternating", "yaw"
+SILENT = "frozen", "late", "lost"
+WRONG = {
+    "pose off for up to 2 s (a jump, every other reading, or the yaw)": ("brief", POSE),
+    "readings frozen or late for up to 1 s, or lost for up to 2 s": ("brief", SILENT),
+    "pose off for 5 s (a jump, every other reading, or the yaw)": ("5 s", POSE),
+    "readings frozen, late or lost for 5 s": ("5 s", SILENT),
+}
+"""Fault -> rows of recovery.json that have it."""
+
+
+def faults(found):
+    """What a fault of the sensors does to a run."""
+    heads, lines = ["fault"], [[name] for name in WRONG]
+    for car in CARS:
+        heads += [
+            f"{car}: largest distance [m]",
+            f"{car}: runs over 2 m away",
+            f"{car}: runs back at the end",
+        ]
+        for line, (length, kinds) in zip(lines, WRONG.values(), strict=True):
+            rows = [found[car, f"{kind}, {length}"] for kind in kinds]
+            assert sum(row["runs"] for row in rows) == 180
+            largest = max(row["largest_m"] or np.inf for row in rows)
+            texts = (
+                f"{largest:.2f}",
+                str(sum(row["departures"] for row in rows)),
+                str(sum(row["back"] for row in rows)),
+            )
+            line += [measured(text, *rows, policy=policy_of(car)) for text in texts]
+    return table(heads, lines)
+
+
+def stops(found):
+    """How far a car rolls that is asked to brake."""
+    drivers = {"guard": "in the shield", "bare": "without it"}
+    lines = []
+    for friction in (0.7, 0.3):
+        for driver, where in drivers.items():
+            rows = {
+                car: found[car, f"brake, friction {friction}: {driver}"] for car in CARS
+            }
+            longest = by_car(lambda of: f"{of['longest_m']:.1f}", rows)
+            lines.append([f"friction {friction}, {where}", *longest])
+    return table(["way to a stand [m]", *CARS], lines)
+
+
+def detection(found):
+    """When an offset of the steering is found."""
+    drivers = {
+        "law": "while the law drives",
+        "class": "while the law drives with the ν of the class",
+    }
+    lines = []
+    for driver, when in drivers.items():
+        rows = {
+            car: found[car, f"steering offset 1.0 degrees, {driver}"] for car in CARS
+        }
+        within = by_car(lambda of: f"{100 * of['within_3s']:.1f}", rows)
+        late = by_car(lambda of: f"{of['s_99']:.1f}", rows)
+        lines.append([f"found within 3 s {when} [% of runs]", *within])
+        lines.append([f"time in which 99 % are found {when} [s]", *late])
+    return table(["offset of 1°", *CARS], lines)
+
+
+UNSEEN = "position bias", "drift", "yaw bias"
+"""Errors that no sensor contradicts."""
+
+
+def alarms(found):
+    """How often a car is farther away than claimed, and how often alarms are false."""
+    counted = {
+        car: [
+            row
+            for (whose, name), row in found.items()
+            if whose == car
+            and "steps" in row
+            and not any(one in name for one in UNSEEN)
+        ]
+        for car in CARS
+    }
+    quiet = {car: found[car, "class"] for car in CARS}
     lines = [
-        [name, *(cell(car, *about) for car in CARS)]
-        for name, (cell, *about) in cells.items()
+        [
+            name,
+            *(
+                measured(
+                    f"{sum(row[field] for row in rows):,}", *rows, policy=policy_of(car)
+                )
+                for car, rows in counted.items()
+            ),
+        ]
+        for name, field in {
+            "steps of all runs in the shield, but for those with a bias or drift": "steps",
+            "of them: steps farther away than `info` claims": "beyond_claim",
+        }.items()
     ]
-    return table(["outside the box", *CARS], lines)
+    lines += [
+        [
+            "runs under the conditions of the certificate",
+            *by_car(lambda of: str(of["runs"]), quiet),
+        ],
+        [
+            "of them: runs with an alarm, which is false",
+            *by_car(lambda of: str(of["runs_not_healthy"]), quiet),
+        ],
+    ]
+    return table(["", *CARS], lines)
+
+
+# ---- planners
 
 
 def timing():
     """A control step of the dynamic car by samples, horizon and vehicles."""
     devices = read("benchmarks/device.json")["devices"]
-    policies = [about["policies"]["dynamic_path"] for about in devices.values()]
+    policy = policy_of("dynamic")
+    found = {name: about["policies"][policy] for name, about in devices.items()}
+    names = ["CPU" if name == "cpu" else name for name in found]
 
     def case(step):
-        cars = f", {step['vehicles']} cars, {step['at_once']} at once"
-        return f"{step['samples']}×{step['horizon']}{cars * (step['vehicles'] > 1)}"
+        text = f"{step['samples']} samples × {step['horizon']} steps"
+        if step["vehicles"] > 1:
+            text += f", {step['vehicles']} cars in batches of {step['at_once']}"
+        return text
 
     def size(step):
-        vehicles = step["vehicles"], step["at_once"]
-        return *vehicles, step["horizon"] != 20, step["samples"], step["horizon"]
+        return (
+            step["vehicles"],
+            step["at_once"],
+            step["horizon"] != 20,
+            step["samples"],
+            step["horizon"],
+        )
 
-    every, lines = [sorted(one["control_step"], key=size) for one in policies], []
-    for each in zip(*every, strict=True):
-        sizes = each[0]["samples"], each[0]["horizon"], each[0]["vehicles"]
-        if not {64, 1024, 4096, 10, 50, 16} & {*sizes}:
-            took = (one["median_ms"] for one in each)
-            times = (f"{ms:.{1 if ms > 1 else 2}f}" for ms in took)
-            lines.append([case(each[0]), *times, f"{each[-1]['memory_mib']:.1f}"])
-    many = [f"{one['s3']['steps_per_s']:.0f}" for one in policies]
-    lines.append(["simulated steps per second, many episodes", *many, ""])
-    return table(["samples×steps; ms a car", *devices, "memory [MiB]"], lines)
+    def is_shown(step):
+        left_out = {64, 1024, 4096, 10, 50, 16}
+        return not left_out & {step["samples"], step["horizon"], step["vehicles"]}
+
+    steps = [sorted(one["control_step"], key=size) for one in found.values()]
+    lines = []
+    for same in zip(*steps, strict=True):
+        if is_shown(same[0]):
+            times = [step["median_ms"] for step in same]
+            texts = [f"{ms:.1f}" if ms > 1.0 else f"{ms:.2f}" for ms in times]
+            cells = [
+                measured(text, step, policy=policy)
+                for text, step in zip(texts, same, strict=True)
+            ]
+            memory = measured(f"{same[-1]['memory_mib']:.1f}", same[-1], policy=policy)
+            lines.append([case(same[0]), *cells, memory])
+    heads = [
+        "control step of one car",
+        *(f"{name} [ms]" for name in names),
+        "memory [MiB]",
+    ]
+    many = [
+        measured(f"{one['s3']['steps_per_s']:.0f}", one["s3"], policy=policy)
+        for one in found.values()
+    ]
+    episodes = ["simulated steps per second", *many]
+    return "\n\n".join(
+        [table(heads, lines), table(["many episodes at once", *names], [episodes])]
+    )
 
 
 def planners():
     """Time and error of planners around one law, on the same roads."""
     policies = read("benchmarks/device.json")["devices"]["cpu"]["policies"]
-    every = (policies[f"{car}_path"]["planners"] for car in CARS)
+    every = [policies[policy_of(car)]["planners"] for car in CARS]
+    lines = []
+    for rows in zip(*every, strict=True):
+        first = rows[0]
+        line = [
+            first["planner"],
+            measured(f"{first['median_ms']:.1f}", first, policy=policy_of(CARS[0])),
+        ]
+        for car, row in zip(CARS, rows, strict=True):
+            for number in (row["over_law"], row["standard_error"]):
+                line.append(measured(f"{number:.2f}", row, policy=policy_of(car)))
+        lines.append(line)
+    heads = ["planner", "step [ms]"]
+    for place in ("dynamic, S3", "kinematic, S2"):
+        heads += [f"{place}: error over the law's", "its standard error"]
+    return table(heads, lines)
 
-    def error(row):
-        return f"{row['over_law']:.2f}±{row['standard_error']:.2f}"
 
-    lines = [
-        [rows[0]["planner"], f"{rows[0]['median_ms']:.1f}", *map(error, rows)]
-        for rows in zip(*every, strict=True)
-    ]
-    return table(["planner", "[ms]", "dynamic, S3", "kinematic, S2"], lines)
+CAUSES = {
+    "force, 3 s": "side force up to 1 kN, another every 3 s",
+    "mass + 30 %": "mass + 30 %",
+    "stiffness - 30 %": "tyre stiffness − 30 %",
+    "steering + 1 degree": "steering angle + 1°",
+    "nothing, S3": "none",
+}
+"""Case of adaptation.json -> what nobody measures."""
+KNOWING = {
+    "oracle that knows": "knows the cause",
+    "SFKD": "SFKD",
+    "SFKD, adaptive": "SFKD, adapting",
+}
+"""Row of adaptation.json -> who drives."""
 
 
 def adaptation():
-    """Errors with causes that nobody measures, dynamic car."""
-    rows = read("benchmarks/adaptation.json")["rows"]
-    errors = {
-        (row["car"], row["case"], row["row"]): np.mean(row["rmse_mm"]) for row in rows
+    """Errors on S3 with causes that nobody measures."""
+    found = {
+        (row["car"], row["case"], row["row"]): row
+        for row in read("benchmarks/adaptation.json")["rows"]
     }
-    kinds = (
-        "force, 3 s",
-        "mass + 30 %",
-        "stiffness - 30 %",
-        "steering + 1 degree",
-        "nothing, S3",
-    )
-    systems = ("oracle that knows", "SFKD", "SFKD, adaptive")
-
-    def cell(car, kind):
-        return "; ".join(f"{errors[car, kind, name]:.1f}" for name in systems)
-
-    head = ["lateral RMSE [mm]: knows the cause; SFKD; SFKD, adaptive", *CARS]
-    return table(head, [[kind, *(cell(car, kind) for car in CARS)] for kind in kinds])
+    heads = ["unmeasured cause; lateral RMSE [mm]"]
+    heads += [f"{car}: {who}" for car in CARS for who in KNOWING.values()]
+    lines = []
+    for case, cause in CAUSES.items():
+        line = [cause]
+        for car in CARS:
+            rows = [found[car, case, system] for system in KNOWING]
+            line += [
+                measured(f"{np.mean(row['rmse_mm']):.1f}", row, policy=policy_of(car))
+                for row in rows
+            ]
+        lines.append(line)
+    return table(heads, lines)
 
 
 def peers():
     """One control step beside other libraries, on one problem."""
-    rows = read("benchmarks/timing.json")["rows"]
+    document = read("benchmarks/timing.json")
+    rows = document["rows"]
     ours = rows[0]["best_ms"]
-    return table(
-        ["1500 samples x 20 steps, two cores", "best [ms]", "over ours"],
+    lines = [
         [
-            [row["contender"], f"{row['best_ms']:.1f}", f"{row['best_ms'] / ours:.2f}"]
-            for row in rows
-        ],
+            row["contender"],
+            measured(f"{row['best_ms']:.1f}", document),
+            measured(f"{row['best_ms'] / ours:.2f}", document),
+        ]
+        for row in rows
+    ]
+    return table(
+        ["1500 samples x 20 steps, two cores", "best [ms]", "over ours"], lines
     )
 
 
-def wide():
-    """What the certificates of the policies for lanes say."""
-    about = [
-        read(PRETRAINED / f"{car}_path/certificate.json")["corridor"] for car in CARS
-    ]
-    lines = [
-        ["corridor [m]", *(f"{one['corridor_m']:.3f}" for one in about)],
-        *(
-            [
-                f"fresh runs inside: {group.replace('_', ' ')}",
-                *(f"{one['by_group'][group]['coverage']:.3f}" for one in about),
-            ]
-            for group in about[0]["by_group"]
-        ),
-        ["S3", *(f"{one['by_scenario']['s3']['coverage']:.3f}" for one in about)],
-    ]
-    return table(["", *CARS], lines)
+# ---- lanes
+
+DRIVERS = {
+    "lane": "the policy in its lane",
+    "oracle": "MPPI that knows the car",
+    "oracle in the guard": "MPPI that knows the car, in the shield",
+}
+"""System of lane.json -> who drives."""
+SITUATIONS = {
+    "pedestrian, friction 0.9": "pedestrian, friction 0.9",
+    "pedestrian, friction 0.3": "pedestrian, friction 0.3",
+    "random courses": "obstacles at random",
+    "enemy": "obstacles placed by a search",
+}
+"""Row of lane.json -> what happens."""
 
 
 def lane():
     """Obstacles that are seen late: what each system hits, and how fast it is."""
     rows = [row for row in read("benchmarks/lane.json") if "collisions" in row]
-    found = {(row["car"], row["system"], row["row"]): row for row in rows}
-    columns = list(dict.fromkeys((row["car"], row["system"]) for row in rows))
-
-    def cell(car, system, label):
-        row = found.get((car, system, label))
-        return row and f"{row['collisions']}/{row['runs']}, {row['mean_speed']:.1f}"
-
-    head = ["runs with a collision, mean speed [m/s]", *map(": ".join, columns)]
-    labels = dict.fromkeys(label for _, _, label in found)
-    lines = [
-        [one, *(cell(*column, one) or "–" for column in columns)] for one in labels
-    ]
-    return table(head, lines)
+    order = list(SITUATIONS)
+    rows.sort(key=lambda row: (order.index(row["row"]), row["car"]))
+    lines = []
+    for row in rows:
+        texts = (
+            str(row["runs"]),
+            str(row["collisions"]),
+            str(row["left_the_lane"]),
+            f"{row['mean_speed']:.1f}",
+        )
+        cells = [measured(text, row, policy=policy_of(row["car"])) for text in texts]
+        driver = DRIVERS[row["system"]]
+        lines.append([SITUATIONS[row["row"]], row["car"], driver, *cells])
+    heads = ["situation", "car", "driver", "runs", "with a collision"]
+    return table([*heads, "leave the lane", "mean speed [m/s]"], lines)
 
 
 def lane_time():
     """Milliseconds of a control step in a lane."""
     rows = [row for row in read("benchmarks/lane.json") if "step_ms" in row]
-    cells = [
-        [f"{row['car']}, {row['row']}", row["search_ms"], row["step_ms"]]
+    lines = [
+        [
+            f"{row['car']}, {row['row']}",
+            *(
+                measured(f"{row[name]:.1f}", row, policy=policy_of(row["car"]))
+                for name in ("search_ms", "step_ms")
+            ),
+        ]
         for row in rows
     ]
-    return table(["[ms]", "search", "whole step"], cells)
+    return table(["control step in a lane", "search [ms]", "whole step [ms]"], lines)
 
 
 BLOCKS = {
@@ -319,6 +560,7 @@ BLOCKS = {
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/results.md": results.TABLES | {"peers": peers},
 }
+"""Page -> name of a block -> what fills it."""
 
 
 def written():

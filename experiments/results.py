@@ -1,12 +1,15 @@
-"""Results in the repository: one JSON a benchmark, one line a row, and the tables of docs/results.md.
+"""The committed results of comparisons, and the tables of docs/results.md.
 
-    python -m experiments.results benchmark [RUN]    takes runs/RUN/results.json; bench3 adds its rows
-    python -m experiments.results figure1 [RUN]      keeps one episode of runs/RUN, by default table1
-    python -m benchmarks.pages                       writes the tables
-    python -m experiments.paper_figures              draws the figures
+    python -m experiments.results benchmark [RUN]  condenses runs/RUN/results.json
+    python -m experiments.results bench3 [RUN]     adds the rows of a run to bench3.jsonl
+    python -m experiments.results figure1 [RUN]    keeps an episode of runs/RUN (table1)
+    python -m benchmarks.pages                     writes the tables
+    python -m experiments.paper_figures            draws the figures
 
-A row keeps the lateral RMSE of every episode of every training, from which intervals are
-computed here; Holm's correction needs the whole comparison and was made by `compare`.
+RUN is by default the name before it. A file has one line for each row. A row keeps the
+lateral RMSE of every episode of every training, from which the intervals are computed here.
+Holm's correction needs the whole comparison, so that `compare` made it. Condense results
+with the code that drove them: every row is stamped with the code of this moment.
 """
 
 import argparse
@@ -19,7 +22,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from benchmarks import write
+from benchmarks import digest, stamp, write
+from benchmarks.tables import measured, table
 from experiments import paper_figures
 from sfkd_jax import evaluation
 from sfkd_jax.report import style
@@ -28,8 +32,12 @@ HOME = Path(__file__).parent
 TABLE1 = HOME.parent / "conf" / "comparison" / "table1.yaml"
 BENCHMARKS = ("benchmark", "table1", "figure2", "corridor")
 FIGURE1 = "figure1"
-CARS = "kinematic", "kinematic_stiff", "dynamic"
-VEHICLES = dict(zip(CARS, ("kinematic", "stiff kinematic", "dynamic"), strict=True))
+VEHICLES = {
+    "kinematic": "kinematic",
+    "kinematic_stiff": "stiff kinematic",
+    "dynamic": "dynamic",
+}
+"""Car -> its name in a table."""
 LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
     "sfkd_no_fiber": "SFKD without e (− fiber)",
     "icode_extrinsic": "ICODE, e extrinsic",
@@ -42,6 +50,7 @@ LABELS = {name: look.label for name, look in style.SYSTEMS.items()} | {
 }
 """Row of a comparison -> its name in a table, in the order of the tables."""
 LEVEL = 0.05
+"""Of the tests whose results the tables mark."""
 BENCH3 = HOME / "bench3.jsonl"
 PATH_ROWS = (
     *("sfkd", "sfkd_alone", "sfkd_no_contraction"),
@@ -61,19 +70,24 @@ BENCH3_KEEPS = (
 )
 
 
-def condense(results):
-    """What is kept of the results of `compare`: settings in short, rows in short.
+def condense(results, policy=None):
+    """What is kept of the results of `compare` or `evaluate`: short settings and rows.
 
     Args:
         results: content of results.json.
+        policy: file of the policy that drove in all rows; None if each row has a model of
+            its own.
     """
+    fields = stamp()
+    if policy is not None:
+        fields["weights"] = digest(policy)
     protocol = results.get("config", {}).get("evaluation", {})
     made_by = {row.get("provenance", {}).get("commit") for row in results["rows"]}
     return {
         "commits": sorted(made_by - {None}),
         "seed": protocol.get("seed"),
         "episode_s": results["rows"][0]["episode_s"],
-        "rows": [_row(row) for row in results["rows"]],
+        "rows": [_row(row) | fields for row in results["rows"]],
     }
 
 
@@ -106,7 +120,8 @@ def along_path():
 def _bench3_row(row, samples):
     """One line: row, plant and scenario, errors by training and episode [mm]."""
     kept = _row(row)
-    name, errors = kept["row"], np.asarray(kept["rmse_mm"])
+    name = kept["row"]
+    errors = np.asarray(kept["rmse_mm"])
     return {
         "row": {"law": "law_learned", "law_plant": "law_true"}.get(name, name),
         "frame": "path" if "path" in kept["controller"] else "body",
@@ -117,6 +132,7 @@ def _bench3_row(row, samples):
         "interval_mm": np.round(evaluation.mean_interval(errors)[1], 3).tolist(),
         "commit": row["provenance"]["commit"],
         **{name: kept[name] for name in BENCH3_KEEPS},
+        **stamp(),
     }
 
 
@@ -124,7 +140,7 @@ def _row(row):
     """One line: who drove where, every episode's RMSE [mm] by training, extremes."""
     seeds = row["seeds"]
     errors = 1e3 * np.asarray(row["rmse_episodes_m"]).reshape(len(seeds), -1)
-    difference = row["difference_to_sfkd"] or {}
+    compared = row["difference_to_sfkd"] or {}
     controller = row["controller"]
     if controller == "mppi" and row["sampling"] == "plain":
         # The option keeps the name of the planner that it changes.
@@ -137,7 +153,7 @@ def _row(row):
         "seeds": seeds,
         "parameters": row["params"],
         "alpha": row["alpha"],
-        "p_holm": difference.get("p_holm"),
+        "p_holm": compared.get("p_holm"),
         "largest_mm": round(1e3 * row["max_deviation_m"], 1),
         "steering_rad_per_s": round(row["smoothness_rad_per_s"], 4),
         "left_the_lane": row["departures"],
@@ -175,57 +191,82 @@ def difference(row, reference):
     return evaluation.paired_difference(*errors)
 
 
-def cell(row, reference):
-    """Mean and 95 % interval [mm]; † better, * worse than SFKD after Holm's correction."""
-    errors = np.asarray(row["rmse_mm"])
-    if left := row["left_the_lane"]:
-        return f"{left} of {errors.size} leave the lane"
-    mean, (low, high) = evaluation.mean_interval(errors)
-    mark = ""
+def mean_error(row, reference):
+    """Mean error [mm]; † better, * worse than SFKD after Holm's correction."""
+    if row["left_the_lane"]:
+        return _left_the_lane(row)
+    text = f"{np.mean(row['rmse_mm']):.1f}"
     if row["p_holm"] is not None and row["p_holm"] < LEVEL:
-        mark = " \\*" if difference(row, reference)["mean"] > 0 else " †"
-    return f"{mean:.1f} ({low:.1f} to {high:.1f}){mark}"
+        text += " \\*" if difference(row, reference)["mean"] > 0 else " †"
+    return measured(text, row)
 
 
-def markdown(heads, rows):
-    """A table in Markdown; a bar in a cell does not end it."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    escaped = ([str(cell).replace("|", "\\|") for cell in line] for line in lines)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in escaped)
+def half_width(row):
+    """Half of the 95 % interval of the mean error [mm]."""
+    if row["left_the_lane"]:
+        return "–"
+    _, (low, high) = evaluation.mean_interval(np.asarray(row["rmse_mm"]))
+    return measured(f"{(high - low) / 2:.1f}", row)
+
+
+def _left_the_lane(row):
+    """What a table says in place of a mean over runs that did not stay in their lane."""
+    count = row["left_the_lane"]
+    everywhere = count == np.size(row["rmse_mm"])
+    text = "leaves the lane" if everywhere else f"{count} runs leave the lane"
+    return measured(text, row)
 
 
 def systems_table(rows, columns):
-    """Errors with intervals: row -> column -> results, and column -> its head."""
-    lines = []
+    """Mean errors, and in a second table how well they are known.
+
+    Args:
+        rows: row -> column -> results.
+        columns: column -> its heading.
+    """
+    means, widths = [], []
     for label, driven in rows.items():
-        driven = {at: row for at, row in driven.items() if at in columns}
-        cells = [
-            cell(driven[at], rows["sfkd"][at]) if at in driven else "–"
-            for at in columns
-        ]
-        trainings = min(len(row["seeds"]) for row in driven.values())
-        learned = next(iter(driven.values()))["parameters"]
-        lines.append([LABELS[label], *cells, trainings if learned else "–"])
-    return markdown(["lateral RMSE [mm]", *columns.values(), "trainings"], lines)
+        mean_line, width_line = [LABELS[label]], [LABELS[label]]
+        for place in columns:
+            row = driven.get(place)
+            mean_line.append(mean_error(row, rows["sfkd"][place]) if row else "–")
+            width_line.append(half_width(row) if row else "–")
+        means.append([*mean_line, _trainings(driven)])
+        widths.append(width_line)
+    headings = columns.values()
+    parts = (
+        table(["mean lateral RMSE [mm]", *headings, "trainings"], means),
+        table(["half width of the 95 % interval [mm]", *headings], widths),
+    )
+    return "\n\n".join(parts)
+
+
+def _trainings(driven):
+    """How often the model of a row was trained, where it was trained least."""
+    learned = any(row["parameters"] for row in driven.values())
+    return min(len(row["seeds"]) for row in driven.values()) if learned else "–"
 
 
 def paper_table():
     """The paper's rows: what it prints beside what was driven here, kinematic plant."""
     controllers = ("mppi", "koopman_mpc")
     settings = yaml.safe_load(TABLE1.read_text("utf-8"))["paper"]
-    at = [settings["columns"].index(f"rmse_{name}_m") for name in ("s2", "s3")]
-    on = {name: of_scenario("table1", name, controllers) for name in ("s2", "s3")}
+    printed_at = {
+        scenario: settings["columns"].index(f"rmse_{scenario}_m")
+        for scenario in ("s2", "s3")
+    }
+    driven = {name: of_scenario("table1", name, controllers) for name in printed_at}
     lines = []
-    for label in on["s3"]:
-        cells = []
-        for number, driven in enumerate(on.values()):
-            mean = np.mean(driven[label]["kinematic"]["rmse_mm"])
-            printed = settings.get(label)
-            shown = f"{1e3 * printed[at[number]]:.0f}" if printed else "–"
-            cells += [f"{mean:.1f}", shown]
-        lines.append([LABELS[label], *cells])
+    for label in driven["s3"]:
+        line = [LABELS[label]]
+        printed = settings.get(label)
+        for scenario, place in printed_at.items():
+            row = driven[scenario][label]["kinematic"]
+            line.append(measured(f"{np.mean(row['rmse_mm']):.1f}", row))
+            line.append(f"{1e3 * printed[place]:.0f}" if printed else "–")
+        lines.append(line)
     heads = ["lateral RMSE [mm]", "S2, here", "S2, paper", "S3, here", "S3, paper"]
-    return markdown(heads, lines)
+    return table(heads, lines)
 
 
 BODY = partial(of_scenario, "benchmark", "s3", ("mppi", "koopman_mpc"))
@@ -259,7 +300,8 @@ def main():
     if options.name == FIGURE1:
         document = paper_figures.condense_episode(folder, results)
     else:
-        document = condense(results)
+        policy = folder / "policy.safetensors"
+        document = condense(results, policy if policy.exists() else None)
     write(HOME / f"{options.name}.json", document, document.pop("rows"))
 
 

@@ -1,11 +1,14 @@
 """The results in the repository: docs/results.md says what its files hold."""
 
+import hashlib
 import json
 import re
 
 import numpy as np
 import pytest
 
+import benchmarks
+from benchmarks import pages, tables
 from experiments import results
 
 PAGE = (results.HOME.parent / "docs" / "results.md").read_text("utf-8")
@@ -114,3 +117,114 @@ def test_what_adaptation_brings():
     assert ratio("dynamic", "stiffness - 30 %") < 1.205
     assert round(ratio("dynamic", "e not measured"), 1) == 1.2
     assert 2.0 < ratio("kinematic", "e not measured") < 2.2
+
+
+# ---- which numbers are old
+
+
+@pytest.fixture
+def ships(tmp_path, monkeypatch):
+    """A policy and goldens that ship, as files that a test may change."""
+    goldens, policy = tmp_path / "controls.npz", tmp_path / "car" / "policy.safetensors"
+    policy.parent.mkdir()
+    goldens.write_bytes(b"controls")
+    policy.write_bytes(b"weights")
+    monkeypatch.setattr(benchmarks, "GOLDENS", goldens)
+    monkeypatch.setattr(benchmarks, "PRETRAINED", tmp_path)
+    return goldens, policy
+
+
+def test_a_stamp_is_the_beginning_of_the_hashes_of_what_ships(ships):
+    first = {
+        name: hashlib.sha256(name.encode()).hexdigest()[:12]
+        for name in ("controls", "weights")
+    }
+    assert benchmarks.stamp("car") == first
+    assert benchmarks.stamp() == {"controls": first["controls"]}
+
+
+@pytest.mark.parametrize("changed", [0, 1])
+def test_a_row_is_old_as_soon_as_controls_or_weights_that_ship_are_others(
+    ships, changed
+):
+    row = {"rmse_mm": 7.0} | benchmarks.stamp("car")
+    assert not benchmarks.is_old(row, "car")
+    ships[changed].write_bytes(b"others")
+    assert benchmarks.is_old(row, "car")
+    # A model that was trained for the row does not depend on the weights that ship.
+    assert benchmarks.is_old(row) == (changed == 0)
+
+
+def test_a_row_without_a_stamp_is_old(ships):
+    assert benchmarks.is_old({"rmse_mm": 7.0})
+    assert benchmarks.is_old({"rmse_mm": 7.0} | benchmarks.stamp(), "car")
+
+
+@pytest.mark.parametrize(
+    ("old", "marked"),
+    [
+        ("", []),
+        ("a", ["1 ‡"]),
+        ("ab", ["first ‡"]),
+        ("ac", ["left ‡"]),
+        ("abc", ["left ‡", "first ‡"]),
+        ("abcd", ["table ‡"]),
+    ],
+)
+def test_a_mark_stands_once_for_all_that_is_old(old, marked):
+    a, b, c, d = (
+        tables.Measured(text, name in old)
+        for name, text in zip("abcd", "1234", strict=True)
+    )
+    made = tables.table(["table", "left", "right"], [["first", a, b], ["second", c, d]])
+    assert re.findall(r"[a-z0-9]+ ‡", made.split("\n\n")[0]) == marked
+    assert made.endswith(tables.OLD_MEANS) == bool(old)
+
+
+NOT_OURS = "trainings", "S2, paper", "S3, paper"
+"""Columns whose numbers nobody drove here."""
+
+
+def printed():
+    """Every table of every page: (block, headings, rows)."""
+    for blocks in pages.BLOCKS.values():
+        for name, build in blocks.items():
+            for part in build().split("\n\n"):
+                if part.startswith("|"):
+                    lines = [
+                        [cell.strip() for cell in line[2:-2].split(" | ")]
+                        for line in part.splitlines()
+                    ]
+                    yield name, lines[0], lines[2:]
+
+
+def test_every_number_that_a_page_prints_is_marked_once_it_is_old(monkeypatch):
+    monkeypatch.setattr(tables, "is_old", lambda row, policy=None: True)
+    monkeypatch.setattr(pages, "is_old", lambda row, policy=None: True)
+    of_others = {}, {"content_sha256": "of other weights"}
+    monkeypatch.setattr(pages.store, "read_arrays", lambda *_, **__: of_others)
+    numbers = 0
+    for name, heads, rows in printed():
+        for row in rows:
+            for head, cell in zip(heads[1:], row[1:], strict=True):
+                if re.search(r"\d", cell) and head not in NOT_OURS:
+                    places = heads[0], head, row[0], cell
+                    assert any(one.endswith("‡") for one in places), (name, places)
+                    numbers += 1
+    assert numbers > 400
+
+
+def test_no_number_is_marked_while_it_is_new(monkeypatch):
+    monkeypatch.setattr(tables, "is_old", lambda row, policy=None: False)
+    monkeypatch.setattr(pages, "is_old", lambda row, policy=None: False)
+    assert [name for name, *lines in printed() if "‡" in str(lines)] == []
+
+
+def test_a_cell_has_one_number_and_the_first_page_eight_rows():
+    for name, heads, rows in printed():
+        assert len(heads) <= 7, name
+        if name == "corridor":
+            assert len(rows) <= 8
+        for row in rows:
+            for cell in row[1:]:
+                assert len(re.findall(r"\d[\d.,]*", cell)) <= 1, (name, cell)
