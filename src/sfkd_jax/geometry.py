@@ -1,10 +1,11 @@
 """Poses in the plane, and path coordinates: a vehicle relative to its path.
 
-A path state is a `State` whose pose is that of the foot point in its own frame, 0, and
-whose body is ξ = (e_y [m], e_ψ [rad], v [m/s], …): distance left of the path, yaw
-relative to it, and the vehicle's own body state. Its control is w = (ν, κ, v_ref): a
-perturbation added to the law's control, the path's curvature [1/m] over the step, and
-the reference speed [m/s].
+A path state describes a vehicle in the frame of its foot point, the nearest point of
+the path. It is a `State` whose pose is (0, 0, 0) and whose body is
+ξ = (e_y [m], e_ψ [rad], v [m/s], …): the distance left of the path, the yaw relative to
+the path, and the body state of the vehicle. The control that belongs to it is
+w = (ν, κ, v_ref): a perturbation that is added to the control of the law, the curvature
+of the path [1/m] over the step, and the reference speed [m/s].
 """
 
 from __future__ import annotations
@@ -44,17 +45,21 @@ def rotate(angle: Float[Array, ""], vector: Float[Array, " 2"]) -> Float[Array, 
 
 
 def entrywise(function: Callable[..., Scalar], *vectors: Any) -> Array:
-    """Return a function of the entries of vectors, one by one.
+    """Return a function of the entries of vectors, applied entry by entry.
 
-    A planner has the samples as the last axis. One operation on a vector of each of
-    them and another that all share, or a number of each, would turn the arrays around.
+    A planner keeps its samples on the last axis. If XLA saw one operation on whole
+    vectors, some of one sample and some shared by all samples, it would transpose the
+    arrays in memory. Working on single entries, behind a barrier, keeps the layout.
     """
     entries = [function(*entries) for entries in zip(*vectors, strict=True)]
     return jnp.stack(jax.lax.optimization_barrier(entries))
 
 
 def put(vector: Array, index: int, value: Array) -> Array:
-    """Return the vector with another entry; a choice fuses where a scatter does not."""
+    """Return the vector with the entry at `index` replaced by `value`.
+
+    It is a selection, because XLA fuses a selection and does not fuse a scatter.
+    """
     return jnp.where(np.arange(vector.shape[0]) == index, value, vector)
 
 
@@ -77,30 +82,34 @@ def between(
 
 
 FAR = 5e4
-"""Distance from the origin up to which float32 resolves positions well enough, to 4 mm
-[m].
-"""
+"""Distance from the origin [m] up to which float32 resolves positions to 4 mm."""
 CELL = 2048.0
-"""Spacing of the origins of `relative` [m]."""
+"""Spacing of the grid of origins that `relative` chooses from [m]."""
 
 
 Places: TypeAlias = Float[Array | np.ndarray, "..."]
-"""States or points of a reference, p_x and p_y first."""
+"""States or points of a reference; their first two entries are p_x and p_y [m]."""
 
 
 def relative(observation: Places, reference: Places) -> tuple[Places, Places, Places]:
-    """Return both with positions relative to an origin near the reference, and it.
+    """Move observation and reference to an origin near the reference.
 
-    For positions on Earth in double precision, outside `jax.jit`, which rounds its
-    arguments. Nothing changes within 1 km of the origin, and for float32.
+    This is for positions on Earth in double precision. It must be called outside
+    `jax.jit`, which rounds its arguments to float32. Positions within 1 km of the
+    origin and float32 positions are returned unchanged.
+
+    Returns:
+        The observation, the reference and the origin that was subtracted [m].
     """
-    given = (observation, reference)
-    if any(one.dtype.itemsize < 8 for one in given):
+    arrays = (observation, reference)
+    if any(array.dtype.itemsize < 8 for array in arrays):
         return observation, reference, np.zeros(2)
-    xp: Any = jnp if any(isinstance(one, jax.Array) for one in given) else np
-    near = reference[..., 0, :2]
-    # On a grid, or a sensor that freezes would seem to move against the reference.
-    origin = CELL * xp.round(xp.where(xp.isfinite(near), near, 0.0) / CELL)
+    xp: Any = jnp if any(isinstance(array, jax.Array) for array in arrays) else np
+    first_point = reference[..., 0, :2]
+    # The origin jumps on a coarse grid. If it followed the reference continuously, a
+    # frozen position sensor would seem to move against the reference.
+    finite_point = xp.where(xp.isfinite(first_point), first_point, 0.0)
+    origin = CELL * xp.round(finite_point / CELL)
     return (
         shifted(observation, -origin),
         shifted(reference, -origin[..., None, :]),
@@ -109,34 +118,51 @@ def relative(observation: Places, reference: Places) -> tuple[Places, Places, Pl
 
 
 def shifted(states: Any, by: Places) -> Any:
-    """Return states at positions moved `by`; in numpy if both allow it."""
-    host = isinstance(by, np.ndarray) and not isinstance(states, jax.core.Tracer)  # pyright: ignore
-    xp, states = (np, np.asarray(states, by.dtype)) if host else (jnp, states)
+    """Return states whose positions are moved `by`.
+
+    The result is a numpy array of the precision of `by`, if `by` is a numpy array and
+    the states are not traced.
+    """
+    traced = isinstance(states, jax.core.Tracer)  # pyright: ignore
+    if isinstance(by, np.ndarray) and not traced:
+        xp: Any = np
+        states = np.asarray(states, by.dtype)
+    else:
+        xp = jnp
     return xp.concatenate([states[..., :2] + by, states[..., 2:]], axis=-1)
 
 
 def is_precise(observation: State, reference: Reference) -> Bool[Array, ""]:
-    """Whether positions are as near to the origin as their precision needs."""
-    step = jnp.asarray(0.0)
+    """Whether positions are so near to the origin that their type resolves them."""
+    resolution = jnp.asarray(0.0)
     for places in (observation, reference):
         largest = jnp.max(jnp.abs(places[..., :2]))
-        # float64 reaches the same step 5e8 times farther away.
-        step = jnp.maximum(step, largest * jnp.finfo(largest.dtype).eps)
-    # Not `<=`: NaN is somebody else's finding.
-    return ~(step > FAR * jnp.finfo(jnp.float32).eps)
+        # The resolution depends on the type: float64 reaches the same one at a
+        # distance that is 5e8 times larger.
+        spacing = largest * jnp.finfo(largest.dtype).eps
+        resolution = jnp.maximum(resolution, spacing)
+    # `not >` instead of `<=`: a position that is NaN is reported by other checks, not
+    # as a lack of precision.
+    return ~(resolution > FAR * jnp.finfo(jnp.float32).eps)
 
 
 PathState: TypeAlias = Float[Array, " coordinate"]
 """ξ = (e_y, e_ψ, v, …): the body of a path state."""
-LATERAL, HEADING, PATH_SPEED = 0, 1, 2
-"""Indices of e_y, e_ψ and v in ξ."""
+LATERAL = 0
+"""Index of e_y in ξ."""
+HEADING = 1
+"""Index of e_ψ in ξ."""
+PATH_SPEED = 2
+"""Index of v in ξ."""
 PERTURBATION = slice(0, 2)
 """Entries of ν in w."""
-CURVATURE, REFERENCE_SPEED = 2, 3
-"""Indices of κ and v_ref in w."""
+CURVATURE = 2
+"""Index of κ in w."""
+REFERENCE_SPEED = 3
+"""Index of v_ref in w."""
 SMALLEST_SCALE = 0.2
-"""Lower limit of 1 − κ e_y: below it the car is too close to the path's centre of
-curvature for path coordinates to be meaningful.
+"""Lower limit of 1 − κ e_y. Below it the car is so close to the path's centre of
+curvature that path coordinates are not meaningful.
 """
 
 PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]
@@ -161,12 +187,13 @@ def circle_errors(pose: Pose, curvature: Scalar) -> tuple[Scalar, Scalar]:
     y = pose[1]
     yaw = pose[2]
     q = curvature * (x**2 + y**2) - 2.0 * y
-    # 1 + κ q is the squared distance to the centre in radii;
-    # limited before the root, whose gradient at 0 is infinite.
+    # 1 + κ q is the squared distance to the centre of the circle, in radii. It is
+    # limited before the root is taken, because the root has an infinite gradient at 0.
     scale = jnp.sqrt(jnp.maximum(1.0 + curvature * q, SMALLEST_SCALE**2))
-    turned = jnp.arctan2(curvature * x, 1.0 - curvature * y)
-    # Division by at least 1 + 0.2: the conjugate form has no cancellation at κ → 0.
-    return -q / (1.0 + scale), wrap_angle(yaw - turned)
+    circle_yaw = jnp.arctan2(curvature * x, 1.0 - curvature * y)
+    # (1 − √(1 + κ q)) / κ would cancel at κ → 0. Its conjugate form does not, and its
+    # denominator is at least 1.2.
+    return -q / (1.0 + scale), wrap_angle(yaw - circle_yaw)
 
 
 def is_valid(
@@ -192,20 +219,20 @@ def path_coordinates(
 
 
 STANDING = 1e-3
-"""Distance below which two points of a reference are the same place [m]."""
+"""Distance below which two points of a reference count as the same place [m]."""
 SLOWEST = 0.1
-"""Reference speed above which the points have to move [m/s]."""
+"""Reference speed above which consecutive points must be different places [m/s]."""
 
 
 def followable(reference: Reference) -> tuple[Reference, Bool[Array, ""]]:
-    """Return a reference that a car can follow, and whether it is the given one.
+    """Return a reference that a car can follow, and whether nothing had to change.
 
-    The speed is 0 where points stand still at a speed, or where the speed is negative:
-    every law here drives forwards.
+    The speed of a point is set to 0 if the point stands still although it has a speed,
+    or if its speed is negative, since every law here drives forwards.
     """
     steps = jnp.diff(reference[:, :2], axis=0)
     still = jnp.hypot(steps[:, 0], steps[:, 1]) < STANDING
-    # The first point has none before it, and moves as the next one does.
+    # No point comes before the first one: it counts as moving if the next one moves.
     still = jnp.concatenate([still[:1], still]) & (reference[:, 3] > SLOWEST)
     wrong = still | (reference[:, 3] < 0.0)
     speed = jnp.where(wrong, 0.0, reference[:, 3])
@@ -215,31 +242,32 @@ def followable(reference: Reference) -> tuple[Reference, Bool[Array, ""]]:
 def curvature_between(reference: Reference) -> Float[Array, " gap"]:
     """Return κ [1/m] between reference points: the change of yaw over the distance.
 
-    Where points coincide, as where a car waits, it is that of the gap before.
+    Where points coincide, as where a car waits, κ is that of the last gap before at
+    which they do not.
     """
     steps = jnp.diff(reference, axis=0)
     distance = jnp.hypot(steps[:, 0], steps[:, 1])
     # Points that coincide have no direction to turn from.
     moved = distance > STANDING
-    turned = wrap_angle(steps[:, 2])
-    curvature = jnp.where(moved, turned / jnp.where(moved, distance, 1.0), 0.0)
+    yaw_change = wrap_angle(steps[:, 2])
+    curvature = jnp.where(moved, yaw_change / jnp.where(moved, distance, 1.0), 0.0)
     # A car that stops in a bend keeps its steering.
-    last = jax.lax.cummax(jnp.where(moved, jnp.arange(moved.shape[0]), 0))
-    return curvature[last]
+    last_moved = jax.lax.cummax(jnp.where(moved, jnp.arange(moved.shape[0]), 0))
+    return curvature[last_moved]
 
 
 def reference_curvature(reference: Reference) -> Float[Array, " horizon"]:
-    """Return κ [1/m] at each reference point, the mean of both sides."""
+    """Return κ [1/m] at each reference point: the mean of the gaps on both sides."""
     gaps = curvature_between(reference)
     ends = jnp.concatenate([gaps[:1], gaps, gaps[-1:]])
     return 0.5 * (ends[1:] + ends[:-1])
 
 
 def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
-    """Return κ [1/m] over the step to each reference point.
+    """Return κ [1/m] over the step that ends at each reference point.
 
-    The first step begins at the vehicle, where there is no reference point: its
-    curvature is extrapolated linearly from the next two.
+    The first step begins at the vehicle, where there is no reference point. Its
+    curvature is extrapolated linearly from those of the next two steps.
     """
     gaps = curvature_between(reference)
     first = 2.0 * gaps[0] - gaps[min(1, gaps.shape[0] - 1)]
@@ -247,7 +275,10 @@ def curvature_ahead(reference: Reference) -> Float[Array, " horizon"]:
 
 
 def path_state(coordinates: PathState) -> State:
-    """Return ξ as a `State`: the pose of the foot in its own frame, 0, and body ξ."""
+    """Return ξ as a `State`: its pose is (0, 0, 0) and its body is ξ.
+
+    The pose is that of the foot point in its own frame.
+    """
     return jnp.concatenate([jnp.zeros(3), coordinates])
 
 
@@ -260,20 +291,30 @@ def beside(coordinates: PathState, point: Float[Array, " 4"]) -> State:
 
 
 def vehicle_state(coordinates: PathState) -> State:
-    """Return the vehicle's state in the foot frame: pose (0, e_y, e_ψ), body s."""
+    """Return the vehicle's state in the frame of the foot point.
+
+    Its pose is (0, e_y, e_ψ), its body is the vehicle's body state.
+    """
     return jnp.concatenate([jnp.zeros(1), coordinates])
 
 
 def path_step(
     step: Step,
 ) -> Callable[[PathState, Control, Scalar, Environment], PathState]:
-    """Return (ξ, u, κ, e) -> ξ one period later, exact on a circle of curvature κ."""
+    """Return the step of a vehicle in path coordinates, (ξ, u, κ, e) -> ξ⁺.
+
+    It is exact if the path is a circle of curvature κ during the sampling period.
+
+    Args:
+        step: of the vehicle in the world frame, (x, u, e) -> x⁺.
+    """
 
     def along(
         coordinates: PathState, control: Control, curvature: Scalar, env: Environment
     ) -> PathState:
         after = step(vehicle_state(coordinates), control, env)
-        # From the old foot point, through which the circle goes: the errors stay exact.
+        # The new pose is in the frame of the old foot point, and the circle passes
+        # through that point: the errors are exact.
         lateral, heading = circle_errors(after[POSE], curvature)
         return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
 
@@ -283,12 +324,14 @@ def path_step(
 def closed_loop(
     step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]
 ) -> Step:
-    """Return (path state, w, e) -> path state, the vehicle in closed loop with a law.
+    """Return the step of a vehicle in closed loop with a law.
+
+    It maps (path state, w, e) to the path state one sampling period later:
 
         ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e)
 
     Args:
-        step: of the vehicle, in the world frame.
+        step: of the vehicle in the world frame, (x, u, e) -> x⁺.
         law: (ξ, κ, v_ref, e) -> u.
         low: lower limits of the vehicle's controls.
         high: upper limits of the vehicle's controls.
@@ -300,7 +343,7 @@ def closed_loop(
     def closed(state: State, inputs: Control, env: Environment) -> State:
         curvature = inputs[CURVATURE]
         wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
-        # Clipped after the perturbation is added: the actuator limits their sum.
+        # The actuator limits the sum, so the clip comes after the perturbation.
         control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
         return path_state(along(state[BODY], control, curvature, env))
 

@@ -1,9 +1,10 @@
-"""A lane and what stands or moves in it."""
+"""Lanes, obstacles that stand or move in them, and the clearance from obstacles."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +18,9 @@ class Lane(NamedTuple):
 
     Attributes:
         path: centre line.
-        left: distance from it to the left edge [m], positive, (point,).
-        right: to the right edge [m], positive, (point,).
-        speed: wanted [m/s], (point,).
+        left: distance from the centre line to the left edge, positive [m], (point,).
+        right: distance from the centre line to the right edge, positive [m], (point,).
+        speed: wanted speed [m/s], (point,).
     """
 
     path: Path
@@ -29,15 +30,16 @@ class Lane(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """Boxes with round corners; a circle is a point with a radius.
+    """Boxes with round corners. A circle is a box of size 0 with a radius.
 
     Attributes:
-        position: of the centres [m], (obstacle, step, 2): one step for what stands
-            still; else predicted at 0, dt, 2 dt, …, and it stays at the last one.
+        position: of the centres [m], (obstacle, step, 2). An obstacle that stands still
+            has one step. Others have predicted positions at 0, dt, 2 dt, … and stay at
+            the last one.
         yaw: of the boxes [rad], (obstacle,).
         half: half of length and width [m], (obstacle, 2).
-        radius: added all around [m], (obstacle,).
-        present: whether the row is an obstacle, (obstacle,); the others are padding.
+        radius: added all around a box [m], (obstacle,).
+        present: whether a row is an obstacle, (obstacle,); other rows are padding.
     """
 
     position: Float[Array, "*obstacle step 2"]
@@ -55,8 +57,13 @@ def lane_along(path: Path, *, width: float = 7.0, speed: float = 10.0) -> Lane:
         width: from edge to edge [m].
         speed: wanted [m/s].
     """
-    every = jnp.ones(path.points.shape[0])
-    return Lane(path, 0.5 * width * every, 0.5 * width * every, speed * every)
+    ones = jnp.ones(path.points.shape[0])
+    return Lane(
+        path=path,
+        left=0.5 * width * ones,
+        right=0.5 * width * ones,
+        speed=speed * ones,
+    )
 
 
 def circles(
@@ -64,9 +71,14 @@ def circles(
 ) -> Obstacles:
     """Return circles that stand still, from their centres and radii [m]."""
     position = jnp.asarray(position, dtype=float)
-    none = jnp.zeros(position.shape[0])
-    size = jnp.zeros_like(position)
-    return Obstacles(position[:, None], none, size, none + radius, none == 0.0)
+    zeros = jnp.zeros(position.shape[0])
+    return Obstacles(
+        position=position[:, None],
+        yaw=zeros,
+        half=jnp.zeros_like(position),
+        radius=zeros + radius,
+        present=zeros == 0.0,
+    )
 
 
 def outside_box(
@@ -77,16 +89,17 @@ def outside_box(
     """Return the distance of a point from a box [m], negative inside.
 
     Args:
-        along: from the centre to the point, along the box [m].
-        left: across it [m].
-        half: half of length and width [m].
+        along: from the centre of the box to the point, along the box [m].
+        left: from the centre of the box to the point, across the box [m].
+        half: half of length and width of the box [m].
     """
     along = jnp.abs(along) - half[0]
     left = jnp.abs(left) - half[1]
-    # Outside: distance to the nearest corner or side; inside: to the nearest side.
-    corner = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(left, 0.0) ** 2
-    # Finite derivatives in the corner too.
-    return jnp.sqrt(corner + 1e-12) + jnp.minimum(jnp.maximum(along, left), 0.0)
+    # Outside, the distance is to the nearest corner or side. Inside, it is to the
+    # nearest side alone, and the first summand vanishes.
+    squared = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(left, 0.0) ** 2
+    # 1e-12 keeps the derivative of the root finite at 0.
+    return jnp.sqrt(squared + 1e-12) + jnp.minimum(jnp.maximum(along, left), 0.0)
 
 
 def clearance(
@@ -97,10 +110,11 @@ def clearance(
     direction: Float[Array, "2 ..."] | tuple[float, float] = (1.0, 0.0),
     half: tuple[float, float] = (0.0, 0.0),
 ) -> Float[Array, "obstacle ..."]:
-    """Return how far a box is at least from each obstacle [m], negative inside.
+    """Return a lower bound of the distance of a box from each obstacle [m].
 
-    Exact for circles; of two boxes it is the distance of one from the smallest parallel
-    one around the other, the larger of both. Infinite where no obstacle is present.
+    It is negative inside, exact for circles, and infinite where no obstacle is present.
+    For two boxes, each is compared with the smallest box around the other that is
+    parallel to it, and the larger of both distances is returned.
 
     Args:
         obstacles: (obstacle,).
@@ -109,24 +123,27 @@ def clearance(
         direction: cosine and sine of the yaw of the box.
         half: half of its length and width [m]; 0 for a point.
     """
-    return jax.vmap(
-        lambda one: distance(one, place_at(one, step), position, direction, half)
-    )(obstacles)
+
+    def to_obstacle(obstacle: Obstacles) -> Float[Array, ...]:
+        place = place_at(obstacle, step)
+        return distance(obstacle, place, position, direction, half)
+
+    return jax.vmap(to_obstacle)(obstacles)
 
 
 def place_at(
     obstacle: Obstacles, step: Float[Array, ...] | float
 ) -> tuple[Float[Array, ...], Float[Array, ...]]:
-    """Return where one obstacle, a row of `Obstacles`, is after some steps [m]."""
+    """Return where an obstacle, a row of `Obstacles`, is after some steps [m]."""
     places = obstacle.position
-    last = obstacle.position.shape[0] - 1
-    if not last:
-        # What stands still is not looked up for every sample.
+    last = places.shape[0] - 1
+    if last == 0:
+        # An obstacle that stands still is not looked up for every sample.
         return places[0, 0], places[0, 1]
     step = jnp.clip(step, 0.0, last)
     index = jnp.floor(step).astype(int)
-    gone = jnp.diff(places, axis=0, append=places[-1:])
-    columns = *places.T, *gone.T
+    moves = jnp.diff(places, axis=0, append=places[-1:])
+    columns = (*places.T, *moves.T)
     x, y, dx, dy = (column.at[index].get(mode="clip") for column in columns)
     share = step - index
     return x + share * dx, y + share * dy
@@ -138,18 +155,21 @@ def beside(
     direction: Float[Array, "2 point"],
     step: Float[Array, " point"],
 ) -> tuple[Int[Array, " obstacle"], Float[Array, " obstacle"]]:
-    """Return the points of a line that are nearest to obstacles, and how far left [m].
+    """Return which point of a line is nearest to each obstacle, and how far left it is.
 
     Args:
         obstacles: (obstacle,).
         line: positions [m].
-        direction: cosine and sine of its yaw.
+        direction: cosine and sine of the yaw of the line at each point.
         step: number of steps from now until each point is reached.
+
+    Returns:
+        The index of the nearest point, and the distance of the obstacle to the left of
+        the line there [m].
     """
-    x, y = jax.vmap(lambda one: place_at(one, step))(obstacles)
-    x, y = (place.reshape(len(place), -1) for place in (x, y))
-    x = x - line[0]
-    y = y - line[1]
+    x, y = jax.vmap(partial(place_at, step=step))(obstacles)
+    x = x.reshape(len(x), -1) - line[0]
+    y = y.reshape(len(y), -1) - line[1]
     nearest = jnp.argmin(jnp.hypot(x, y), axis=1)
     left = direction[0] * y - direction[1] * x
     return nearest, left[jnp.arange(len(left)), nearest]
@@ -162,31 +182,57 @@ def distance(
     direction: Float[Array, "2 ..."] | tuple[float, float],
     half: tuple[float, float],
 ) -> Float[Array, ...]:
-    """Return the `clearance` from one obstacle, a row of `Obstacles`, at its place."""
-    x, y = (a - b for a, b in zip(place, position, strict=True))
-    (cos, sin) = direction
-    (length, width) = obstacle.half
+    """Return the `clearance` of a box from an obstacle, a row of `Obstacles`.
+
+    Args:
+        obstacle: one.
+        place: x and y of its centre [m].
+        position: of the centre of the box [m].
+        direction: cosine and sine of the yaw of the box.
+        half: half of length and width of the box [m].
+    """
+    box_x, box_y = position
+    x = place[0] - box_x
+    y = place[1] - box_y
+    cos, sin = direction
+    length, width = obstacle.half
     their_cos = jnp.cos(obstacle.yaw)
     their_sin = jnp.sin(obstacle.yaw)
-    parallel = jnp.abs(their_cos * cos + their_sin * sin)
-    across = jnp.abs(their_sin * cos - their_cos * sin)
-    # Half of each box, and of the smallest one around the other that is parallel to it.
-    ours, theirs = (
-        (a + parallel * c + across * d, b + parallel * d + across * c)
-        for (a, b), (c, d) in ((half, (length, width)), ((length, width), half))
+    cos_between = jnp.abs(their_cos * cos + their_sin * sin)
+    sin_between = jnp.abs(their_sin * cos - their_cos * sin)
+
+    def half_of_sum(
+        box: Sequence[Any], other: Sequence[Any]
+    ) -> tuple[Float[Array, ...], Float[Array, ...]]:
+        """Half of the size of `box`, grown by a parallel box around `other`."""
+        return (
+            box[0] + cos_between * other[0] + sin_between * other[1],
+            box[1] + cos_between * other[1] + sin_between * other[0],
+        )
+
+    # The vector between the centres, along and across each of the two boxes.
+    from_box = outside_box(
+        cos * x + sin * y, cos * y - sin * x, half_of_sum(half, (length, width))
     )
-    turned = their_cos * x + their_sin * y, their_cos * y - their_sin * x
-    nearest = jnp.maximum(
-        outside_box(cos * x + sin * y, cos * y - sin * x, ours),
-        outside_box(*turned, theirs),
+    from_obstacle = outside_box(
+        their_cos * x + their_sin * y,
+        their_cos * y - their_sin * x,
+        half_of_sum((length, width), half),
     )
+    nearest = jnp.maximum(from_box, from_obstacle)
     return jnp.where(obstacle.present, nearest - obstacle.radius, jnp.inf)
 
 
 def finite(
     lane: Lane, obstacles: Obstacles
 ) -> tuple[tuple[Lane, Obstacles], Bool[Array, ""]]:
-    """Return a finite scene, and whether it was one; padding may hold anything."""
+    """Return a scene in which every number is finite, and whether it was so before.
+
+    Numbers that are not finite become 0. Rows of padding may hold anything.
+
+    Raises:
+        ValueError: the shapes of lane and obstacles do not fit together.
+    """
     points = lane.path.points.shape[0]
     count = obstacles.position.shape[0]
     sizes = {leaf.shape for leaf in (lane.left, lane.right, lane.speed)}
@@ -198,12 +244,12 @@ def finite(
             f"2), got {[leaf.shape for leaf in obstacles]}"
         )
 
-    def shown(leaf: Array) -> Array:
+    def without_padding(leaf: Array) -> Array:
         present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))
         return jnp.where(present, leaf, jnp.zeros_like(leaf))
 
-    scene = lane, Obstacles(*map(shown, obstacles))
+    scene = (lane, Obstacles(*map(without_padding, obstacles)))
     leaves = jax.tree.leaves(scene)
     clean = jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
-    whole = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)
-    return jax.tree.map(whole, scene), clean
+    zero_for_infinite = partial(jnp.nan_to_num, posinf=0.0, neginf=0.0)
+    return jax.tree.map(zero_for_infinite, scene), clean

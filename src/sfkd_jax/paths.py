@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.types import Reference, Scalar
 
 SPACING = 0.5
-"""Between samples of a path [m]."""
+"""Distance between samples of a path, unless another one is asked for [m]."""
 
 
 class Path(NamedTuple):
@@ -33,10 +33,10 @@ class Path(NamedTuple):
 
 
 class Lap(Path):
-    """A closed path: its last point is its first one, the yaw turned on by a lap.
+    """A closed path: its last point is its first one, with the yaw of a full lap added.
 
-    A type of its own, not a field: whether a path is closed is known when a program is
-    traced, and open paths cost nothing more.
+    It is a type of its own and not a field of `Path`. Whether a path is closed is
+    therefore known when a program is traced, and open paths cost nothing more.
     """
 
 
@@ -44,10 +44,11 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
     """Integrate κ(s) to a path that starts at the origin along x."""
     yaw_steps = 0.5 * (curvature[1:] + curvature[:-1]) * spacing
     yaw = jnp.concatenate([jnp.zeros(1), jnp.cumsum(yaw_steps)])
-    # The chord of an arc points along the yaw of its middle: errors of O(h³) a sample.
-    middle = yaw[:-1] + 0.5 * yaw_steps
-    x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(middle))]) * spacing
-    y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(middle))]) * spacing
+    # The chord of an arc points along the yaw at its middle. For a curvature that is
+    # linear between samples the error of this is O(h³) per sample.
+    chord_yaw = yaw[:-1] + 0.5 * yaw_steps
+    x = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.cos(chord_yaw))]) * spacing
+    y = jnp.concatenate([jnp.zeros(1), jnp.cumsum(jnp.sin(chord_yaw))]) * spacing
     return Path(jnp.stack([x, y, yaw, curvature], axis=1), jnp.asarray(spacing))
 
 
@@ -57,24 +58,29 @@ def path_through(
     """Return a path through positions, resampled at equal distances.
 
     Yaw and curvature are central differences. The path is straight between positions,
-    so these should be dense: several per `spacing` on a sharp turn. The length of an
-    open path is a multiple of `spacing`; a closed one changes its spacing instead.
+    so these should be dense: several per `spacing` on a sharp turn. An open path is cut
+    to a multiple of `spacing`. A closed path keeps its length and changes its spacing.
 
     Args:
         points: positions [m].
         spacing: between samples [m].
         closed: whether the last position leads back to the first, which need not be
             repeated. The path is then a `Lap`.
+
+    Raises:
+        ValueError: a position is not finite, two consecutive ones are the same, or the
+            path is shorter than two spacings.
     """
     if closed and bool(jnp.any(points[0] != points[-1])):
         points = jnp.concatenate([points, points[:1]])
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
-    # `bool` needs concrete arrays: a path is made before a program is traced.
+    # `bool` needs concrete arrays. That is no limitation: a path is made before a
+    # program is traced.
     if not bool(jnp.all(jnp.isfinite(points)) & jnp.all(steps > 0)):
         raise ValueError("a path needs finite positions, no two in a row the same")
     along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
     count = int(along[-1] / spacing) + 1
-    # Central differences of a curvature take three samples.
+    # Central differences of the yaw need three samples.
     if count < 3:
         raise ValueError(
             f"a path of {float(along[-1]):.3g} m has too few samples "
@@ -83,12 +89,15 @@ def path_through(
     if closed:
         spacing = float(along[-1]) / (count - 1)
     s = jnp.arange(count) * spacing
-    x, y = (jnp.interp(s, along, axis) for axis in points.T)
-    if closed:  # goes on by two samples at both ends, for the differences
-        x, y = (jnp.concatenate([one[-3:-1], one, one[1:3]]) for one in (x, y))
+    x = jnp.interp(s, along, points[:, 0])
+    y = jnp.interp(s, along, points[:, 1])
+    # The differences at both ends of a lap need the two samples that follow around it.
+    if closed:
+        x = jnp.concatenate([x[-3:-1], x, x[1:3]])
+        y = jnp.concatenate([y[-3:-1], y, y[1:3]])
     along_x = jnp.asarray(jnp.gradient(x))
     along_y = jnp.asarray(jnp.gradient(y))
-    # Unwrapped: the curvature is its slope, which must not jump by 2π.
+    # The curvature is the slope of the yaw, which must therefore not jump by 2π.
     yaw = jnp.unwrap(jnp.arctan2(along_y, along_x))
     curvature = jnp.asarray(jnp.gradient(yaw)) / spacing
     samples = jnp.stack([x, y, yaw, curvature], axis=1)
@@ -98,10 +107,10 @@ def path_through(
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
-    """Return x, y, yaw, curvature at arc length s [m], which is clamped to the path.
+    """Return x, y, yaw, curvature at arc length s [m].
 
-    Between two samples the path is a clothoid. Around a `Lap` s goes on for ever, and
-    the yaw with it.
+    Between two samples the path is a clothoid. On an open path s is clamped to its
+    length. Around a `Lap` s may have any value, and the yaw grows by a turn per lap.
     """
     if isinstance(path, Lap):
         laps = jnp.floor(s / path.length)
@@ -111,14 +120,14 @@ def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:
     index = jnp.clip(jnp.floor(s / path.spacing).astype(int), 0, last)
     start = path.points[index]
     end = path.points[index + 1]
-    # Clipped: beyond its ends a path stays at its last point.
+    # The clip makes a path stay at its last point beyond its ends.
     ahead = jnp.clip(s - index * path.spacing, 0.0, path.spacing)
     slope = (end[3] - start[3]) / path.spacing
     yaw = start[2] + start[3] * ahead + 0.5 * slope * ahead**2
     # The chord points along the yaw at half the way, as in `path_from_curvature`.
-    middle = start[2] + 0.5 * start[3] * ahead + 0.125 * slope * ahead**2
-    x = start[0] + ahead * jnp.cos(middle)
-    y = start[1] + ahead * jnp.sin(middle)
+    chord_yaw = start[2] + 0.5 * start[3] * ahead + 0.125 * slope * ahead**2
+    x = start[0] + ahead * jnp.cos(chord_yaw)
+    y = start[1] + ahead * jnp.sin(chord_yaw)
     return jnp.stack([x, y, yaw, start[3] + slope * ahead])
 
 
@@ -127,20 +136,23 @@ def project(
 ) -> tuple[Scalar, Scalar]:
     """Return the arc length of the closest point and the signed distance to it [m].
 
-    Newton steps from `s_guess`; left of the path the distance is positive. Beyond an
-    end the closest point is the end; around a `Lap` the arc length starts anew.
+    The distance is positive left of the path. The closest point is found by Newton
+    steps from `s_guess`. Beyond an end of an open path it is that end. Around a `Lap`
+    the arc length starts anew at 0.
     """
     closed = isinstance(path, Lap)
     s = s_guess
-    # Few steps suffice, since the guess is the last foot point moved on.
+    # Three steps suffice, since callers pass the last foot point, moved ahead by the
+    # distance of one step.
     for _ in range(3):
         point = point_at(path, s)
         along, left = _offsets(point, position)
-        # Near the centre of a curve the Newton step would divide by 0.
+        # At the centre of a curve the Newton step would divide by 0.
         s = s + along / jnp.maximum(1.0 - point[3] * left, 0.2)
-        # Every step: one that left the path would go on from a point that is not on it.
+        # After every step: the next one must start at a point of the path.
         s = s % path.length if closed else jnp.clip(s, 0.0, path.length)
-    return s, _offsets(point_at(path, s), position)[1]
+    _, left = _offsets(point_at(path, s), position)
+    return s, left
 
 
 def reference_window(
@@ -154,7 +166,7 @@ def reference_window(
 ) -> Reference:
     """Return the next points at a constant speed: x, y, yaw, speed, (horizon, 4).
 
-    Before the end of a path the speed falls so that the points stop there, at speed 0.
+    Before the end of an open path the speed falls so that the points stop there.
 
     Args:
         path: open, or a `Lap`, which has no end.
@@ -164,63 +176,69 @@ def reference_window(
         horizon: number of points.
         deceleration: towards the end [m/s²].
     """
-    # From one step ahead on: the present state cannot be changed any more.
+    # The first point is one step ahead: the present state cannot be changed any more.
     times = dt * jnp.arange(1, horizon + 1)
     ahead = s + speed * dt * jnp.arange(1, horizon + 1)
     speeds = jnp.broadcast_to(speed, ahead.shape)
     if not isinstance(path, Lap):
-        left = jnp.maximum(path.length - s, 0.0)
-        braking = speed**2 / 2 / deceleration
-        # Until standstill: cruise and brake, or brake alone where the end is near.
-        until = jnp.where(
-            left > braking,
-            (left - braking) / jnp.maximum(speed, 1e-3) + speed / deceleration,
-            jnp.sqrt(2.0 * left / deceleration),
+        remaining = jnp.maximum(path.length - s, 0.0)
+        braking_distance = speed**2 / 2 / deceleration
+        # The vehicle cruises and then brakes. Where the end is nearer than the braking
+        # distance, it brakes from the speed at which it can still stop there.
+        standstill_time = jnp.where(
+            remaining > braking_distance,
+            (remaining - braking_distance) / jnp.maximum(speed, 1e-3)
+            + speed / deceleration,
+            jnp.sqrt(2.0 * remaining / deceleration),
         )
-        falling = deceleration * jnp.maximum(until - times, 0.0)
-        near = (path.length - ahead < braking) & (speed > 0.0)
-        ahead = jnp.where(near, path.length - falling**2 / 2 / deceleration, ahead)
-        speeds = jnp.where(near, falling, speeds)
+        falling = deceleration * jnp.maximum(standstill_time - times, 0.0)
+        brakes = (path.length - ahead < braking_distance) & (speed > 0.0)
+        ahead = jnp.where(brakes, path.length - falling**2 / 2 / deceleration, ahead)
+        speeds = jnp.where(brakes, falling, speeds)
     points = jax.vmap(point_at, in_axes=(None, 0))(path, ahead)
-    # The fourth column of a reference is the speed, where a path has its curvature.
+    # The fourth column of a reference is the speed; that of a path is its curvature.
     return points.at[:, 3].set(speeds)
 
 
 def quintic(
     start: Float[Array, " 3"], target: Scalar, length: Scalar, s: Float[Array, ...]
 ) -> Float[Array, "4 ..."]:
-    """Return d, d', d'', d''' of a lateral move at s, derivatives by arc length.
+    """Return the offset d of a lateral move and its derivatives d', d'', d''' at s.
 
-    The polynomial of degree five from (d, d', d'') at s = 0 to (target, 0, 0) at
-    s = length; beyond its end it stays at the target.
+    The derivatives are by arc length. d is the polynomial of degree five that leads
+    from (d, d', d'') at s = 0 to (target, 0, 0) at s = length. Beyond its end it stays
+    at the target.
 
     Args:
-        start: d [m], d' [-], d'' [1/m].
-        target: [m].
+        start: d [m], d' [-], d'' [1/m] at s = 0.
+        target: d at the end [m].
         length: of the move, positive [m].
         s: distance from its start, not negative [m].
     """
-    first = start[1] * length
-    second = 0.5 * start[2] * length**2
+    # A polynomial of t = s / length in [0, 1]: the powers of s would span many decades.
+    linear = start[1] * length
+    quadratic = 0.5 * start[2] * length**2
     gap = target - start[0]
-    # Over t = s / length in [0, 1], or the powers would span many decades.
-    cubic = 10.0 * gap - 6.0 * first - 3.0 * second
-    quartic = -15.0 * gap + 8.0 * first + 3.0 * second
-    fifth = 6.0 * gap - 3.0 * first - second
-    coefficients = (fifth, quartic, cubic, second, first, start[0])
+    cubic = 10.0 * gap - 6.0 * linear - 3.0 * quadratic
+    quartic = -15.0 * gap + 8.0 * linear + 3.0 * quadratic
+    fifth = 6.0 * gap - 3.0 * linear - quadratic
+    # Highest degree first, as Horner's scheme reads them.
+    coefficients = (fifth, quartic, cubic, quadratic, linear, start[0])
     t = jnp.clip(s / length, 0.0, 1.0)
-    # At the end all derivatives are those of staying there, the third included.
     values = []
+    # From the end on the vehicle stays at the target: all derivatives are 0 there.
     scale = jnp.where(s < length, 1.0, 0.0)
     for order in range(4):
         value = jnp.zeros_like(t)
         for coefficient in coefficients:
             value = value * t + coefficient
         values.append(value if order == 0 else value * scale)
+        # The next derivative by s: that by t, divided by the length once more.
         scale = scale / length
         degree = len(coefficients) - 1
         coefficients = tuple(
-            (degree - i) * one for i, one in enumerate(coefficients[:-1])
+            (degree - index) * coefficient
+            for index, coefficient in enumerate(coefficients[:-1])
         )
     return jnp.stack(values)
 
@@ -228,9 +246,9 @@ def quintic(
 def _offsets(
     point: Float[Array, " 4"], position: Float[Array, " 2"]
 ) -> tuple[Scalar, Scalar]:
-    """Distance of a position ahead of and left of a point on the path [m]."""
+    """Return how far a position is ahead of and left of a point on the path [m]."""
     dx = position[0] - point[0]
     dy = position[1] - point[1]
-    c = jnp.cos(point[2])
-    s = jnp.sin(point[2])
-    return c * dx + s * dy, -s * dx + c * dy
+    cos = jnp.cos(point[2])
+    sin = jnp.sin(point[2])
+    return cos * dx + sin * dy, -sin * dx + cos * dy

@@ -16,6 +16,7 @@ from sfkd_jax.types import (
     Control,
     Environment,
     Fiber,
+    Key,
     Latent,
     Model,
     Params,
@@ -26,21 +27,25 @@ from sfkd_jax.types import (
 
 
 class Folded(NamedTuple):
-    """Parameters of a controller, which `Model.fiber` need not factorise again."""
+    """Parameters with the part of every fiber that does not depend on e.
+
+    `Model.fiber` takes that part from here and does not compute it again.
+    """
 
     weights: Params  # the parameters as they were learned and stored
     shared: Any  # `Model.shared` of these parameters
 
 
 def on_host(function: Callable[[Params], Any], params: Params) -> Any:
-    """Evaluate on the host, or else in full precision, as one program.
+    """Evaluate a function of the parameters on the host, as one program.
 
-    Accelerators round float32 factors to ten bits, which the witnesses of another
-    machine do not survive.
+    Accelerators multiply float32 matrices with factors rounded to ten bits. Weights
+    computed with them would not satisfy the witnesses that another machine found.
+    Where JAX has no host device, the products are computed in full float32 precision.
     """
     try:
         host = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:  # JAX_PLATFORMS names accelerators only
+    except RuntimeError:  # JAX_PLATFORMS may name accelerators only.
         host = None
     with jax.default_device(host), jax.default_matmul_precision("float32"):
         evaluated = jax.jit(function)(jax.device_get(params))
@@ -50,14 +55,22 @@ def on_host(function: Callable[[Params], Any], params: Params) -> Any:
 def fold(model: Model, params: Params, evaluate: Any = None) -> Params:
     """Evaluate once what every control step would otherwise evaluate again.
 
-    Outside of a program with `evaluate=on_host`, as `policy.load` does: one program
-    then serves all who fold parameters of this model.
+    Parameters that are folded already, and those of a model without a shared part, are
+    returned as they are.
+
+    Args:
+        model: that the parameters belong to.
+        params: of the model.
+        evaluate: (function, params) -> value, how `Model.shared` is evaluated. Outside
+            of a compiled program, pass `on_host`, as `policy.load` does: all who fold
+            parameters of this model then share one program. None calls it directly.
     """
     # Folding twice would wrap the weights twice, and `unfold` removes one layer.
     if model.shared is None or isinstance(params, Folded):
         return params
-    shared = model.shared
-    return Folded(params, evaluate(shared, params) if evaluate else shared(params))
+    if evaluate is None:
+        return Folded(params, model.shared(params))
+    return Folded(params, evaluate(model.shared, params))
 
 
 def unfold(params: Params) -> Params:
@@ -68,62 +81,85 @@ def unfold(params: Params) -> Params:
 class Offset(NamedTuple):
     """Parameters of a model together with a shift of its steps.
 
-    `Model.fiber` of these parameters is an `Offset` as well, of the model's own fiber.
+    `Model.fiber` of these parameters is an `Offset` too, with the same fields for a
+    fiber.
+
+    Attributes:
+        params: parameters of the model, folded or not; in a fiber, the model's fiber.
+        inputs: δ, added to every control, as a bias of B(e) u and of the residual.
+        shift: (x, Δx), where every step adds Δx, lifted to the latent at x; in a fiber,
+            that lifted shift b, a latent. None stands for no shift.
     """
 
-    params: Any  # of the model, folded or not; in a fiber, the fiber of the model
-    inputs: Control  # added to every control, as a bias of B(e) u and of the residual
-    # (x, Δx): what every step adds is Δx, lifted at x; in a fiber, a latent. None: 0.
+    params: Any
+    inputs: Control
     shift: Any
 
 
 def with_offset(model: Model) -> Model:
     """Return the model z⁺ = F(z, u + δ; e) + b with parameters `Offset`(params, δ, b).
 
-    Neither δ nor b depends on z, so two predictions differ as those of the model do:
-    the weights that a certificate is about, its rate and its witness are the same. δ
-    and b are data, so changing them compiles nothing.
+    Neither δ nor b depends on z, so that the difference of two predictions evolves as
+    in the model without them. A certificate therefore stays valid: the weights that it
+    is about, its rate and its witness are the same. δ and b are data, so that changing
+    them compiles nothing anew.
     """
 
     def step(fiber: Offset, latent: Latent, control: Control) -> Latent:
         after = model.step(fiber.params, latent, control + fiber.inputs)
-        # None, not zeros: a model without a shift pays nothing for it.
+        # None instead of zeros: a model without a shift pays nothing for it.
         if fiber.shift is None:
             return after
         return jax.tree.map(jnp.add, after, fiber.shift)
 
-    def fiber(params: Offset, env: Environment) -> Offset:
-        own = model.fiber(params.params, env)
-        shift = params.shift
-        # By each model: what guards has another latent than what plans.
-        if shift is not None:
-            at, by = shift
-            _, shift = jax.jvp(lambda state: model.encode(own, state), (at,), (by,))
-        return Offset(own, params.inputs, shift)
+    def init(key: Key) -> Offset:
+        # A scalar 0 broadcasts over any control, whose size is not known here.
+        return Offset(model.init(key), jnp.zeros(()), None)
 
-    def inner(function: Callable[..., Any] | None) -> Any:
-        # Everything else sees the model's own parameters or fiber.
-        return function and (lambda offset, *rest: function(offset.params, *rest))
+    def fiber(params: Offset, env: Environment) -> Offset:
+        model_fiber = model.fiber(params.params, env)
+        if params.shift is None:
+            return Offset(model_fiber, params.inputs, None)
+        # The shift is given in states, since the model of a shield and the one of its
+        # planner have different latents. Each model lifts it by its own encoder.
+        state, state_shift = params.shift
+        encode = partial(model.encode, model_fiber)
+        _, latent_shift = jax.jvp(encode, (state,), (state_shift,))
+        return Offset(model_fiber, params.inputs, latent_shift)
+
+    def transport(before: Offset, after: Offset, latent: Latent) -> Latent:
+        return model.transport(before.params, after.params, latent)
+
+    def on_road(fiber: Offset, road: Control) -> Offset:
+        assert model.on_road is not None
+        return fiber._replace(params=model.on_road(fiber.params, road))
+
+    def unwrapped(function: Callable[..., Any] | None) -> Any:
+        """Call a function of the model with what the `Offset` wraps."""
+        if function is None:
+            return None
+
+        def inner(offset: Offset, *arguments: Any) -> Any:
+            return function(offset.params, *arguments)
+
+        return inner
 
     structure = model.structure
-    on_road = model.on_road
     return model._replace(
-        # A scalar 0 broadcasts over any control, whose size is not known here.
-        init=lambda key: Offset(model.init(key), jnp.zeros(()), None),
+        init=init,
         fiber=fiber,
-        encode=inner(model.encode),
+        encode=unwrapped(model.encode),
         step=step,
-        decode=inner(model.decode),
-        transport=lambda before, after, latent: model.transport(
-            before.params, after.params, latent
-        ),
-        observe=inner(model.observe),
-        # Folding is for the parameters inside, see `Offset.params`.
+        decode=unwrapped(model.decode),
+        transport=transport,
+        observe=unwrapped(model.observe),
+        # The parameters inside of an `Offset` are folded, not the `Offset`.
         shared=None,
         fitting=model.fitting._replace(step_fiber=None),
-        on_road=on_road
-        and (lambda at, road: at._replace(params=on_road(at.params, road))),
-        structure=Structure(inner(structure.explicit), inner(structure.rate)),
+        on_road=None if model.on_road is None else on_road,
+        structure=Structure(
+            explicit=unwrapped(structure.explicit), rate=unwrapped(structure.rate)
+        ),
     )
 
 
@@ -140,32 +176,47 @@ def fibers_along(
     model: Model, params: Params, trajectory: Trajectory
 ) -> tuple[Fiber, Fiber]:
     """Return the fibers of e_0 … e_{T-1} and of e_1 … e_{T-1}, e_{T-1}."""
-    own = model.fitting.step_fiber or (lambda params, env, _: model.fiber(params, env))
-    # At once for all steps, where it is one product, and not in a loop over them.
-    fibers = jax.vmap(partial(own, params))(trajectory.envs, trajectory.controls)
-    # After the last step no further e is known: it is taken to stay.
+    step_fiber = model.fitting.step_fiber
+    # All fibers are computed at once, as one matrix product, and not in a loop.
+    if step_fiber is None:
+        fibers = jax.vmap(partial(model.fiber, params))(trajectory.envs)
+    else:
+        step_fibers = jax.vmap(partial(step_fiber, params))
+        fibers = step_fibers(trajectory.envs, trajectory.controls)
+    # After the last step no further e is known: it is taken to stay as it is.
     later = jax.tree.map(lambda leaf: jnp.concatenate([leaf[1:], leaf[-1:]]), fibers)
     return fibers, later
 
 
 class Predictions(NamedTuple):
-    """Of x_1 … x_T of one trajectory."""
+    """Predictions of x_1 … x_T of one trajectory.
 
-    free: Float[Array, "time state"]  # from x_0
-    single: Float[Array, "time state"]  # each from the true state before
+    Attributes:
+        free: predicted from x_0 alone.
+        single: each predicted from the true state before it.
+        defects: d_k, the errors of single steps in latent coordinates.
+        fibers: of e_0 … e_{T-1}.
+    """
+
+    free: Float[Array, "time state"]
+    single: Float[Array, "time state"]
     defects: Float[Array, "time rank"]
-    fibers: Fiber  # of e_0 … e_{T-1}
+    fibers: Fiber
 
 
 def rollout(model: Model, params: Params, trajectory: Trajectory) -> Predictions:
-    """Predict freely and step by step; return the disturbances d_k of the steps too.
+    """Predict a trajectory freely from its start, and each step from its true state.
 
-        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k)
+    The disturbances of the single steps are
 
-    F is the latent step. Compiled, what is not used costs nothing.
+        d_k = z_{k+1} − T(e_k → e_{k+1}) F(z_k, u_k, e_k),   z_k = Φ(x_k, e_k),
+
+    where F is the latent step and T the transport. In a compiled program, results that
+    are not used cost nothing.
     """
     fibers, later = fibers_along(model, params, trajectory)
-    # In the first environment; one frame for all times, or z could not be compared.
+    # The latents of all times are observed in the frame of the first one. In frames of
+    # their own they could not be compared.
     first = jax.tree.map(lambda leaf: leaf[0], fibers)
     origin = model.encode(first, trajectory.states[0])
     observe = jax.vmap(model.observe, in_axes=(0, None, 0))
@@ -173,14 +224,15 @@ def rollout(model: Model, params: Params, trajectory: Trajectory) -> Predictions
 
     def step(latent: Latent, inputs: Any) -> tuple[Latent, Latent]:
         fiber, fiber_next, control = inputs
-        # First the step under e, then transport to e': z belongs to the next fiber.
+        # The step happens under e. Then z is transported to e', the next fiber.
         latent = model.transport(fiber, fiber_next, model.step(fiber, latent, control))
         return latent, latent
 
     inputs = fibers, later, trajectory.controls
     expected, _ = jax.vmap(step)(now, inputs)
     _, latents = jax.lax.scan(step, origin, inputs)
-    # In the later fibers, to which transport has carried the latents.
+    # Transport has carried the predictions to the later fibers. The true states are
+    # observed there too.
     after = observe(later, origin, trajectory.states[1:])
     return Predictions(
         free=jax.vmap(model.decode)(later, latents),
@@ -198,8 +250,9 @@ def windows(
     length: int,
 ) -> Trajectory:
     """Cut one window of `length` steps per row, from its start."""
-    if length > (steps := trajectories.controls.shape[1]):
-        # A slice out of range would be shifted, not refused.
+    steps = trajectories.controls.shape[1]
+    # `dynamic_slice` would shift a slice that is out of range, and not refuse it.
+    if length > steps:
         raise ValueError(
             f"windows of {length} steps do not fit trajectories of {steps} steps"
         )
@@ -228,7 +281,8 @@ def state_errors(
 ) -> Float[Array, "time state"]:
     """Return predicted minus true states.
 
-    Position along and across the true heading [m], yaw wrapped [rad], body state.
+    The columns are the position error along and across the true heading [m], the
+    wrapped yaw error [rad] and the error of the body state.
     """
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
     yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
@@ -238,8 +292,9 @@ def state_errors(
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:
     """Map a function of a batch over the leading axis, `size` items at a time.
 
-    The last batch is padded: `jax.lax.map` would compile a second program for it. Each
-    batch takes items from all of the axis, of every device that it is spread over.
+    The last batch is padded, because `jax.lax.map` would compile a second program for a
+    smaller one. The items of a batch are spread over the whole axis: where the axis is
+    divided among devices, every device takes part in every batch.
     """
     count = jax.tree.leaves(items)[0].shape[0]
     if count <= size:

@@ -26,6 +26,8 @@ Fiber: TypeAlias = Any
 Latent: TypeAlias = Any
 Step: TypeAlias = Callable[[State, Control, Environment], State]
 
+GRAVITY = 9.81
+"""Acceleration of gravity [m/s²]."""
 POSE = slice(0, 3)
 """Entries of the pose (p_x [m], p_y [m], yaw [rad]) in a state."""
 BODY = slice(3, None)

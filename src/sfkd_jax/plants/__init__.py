@@ -1,13 +1,13 @@
 """Simulated vehicles as pure step functions."""
 
+from sfkd_jax.plants._dynamic import dynamic as dynamic
+from sfkd_jax.plants._kinematic import kinematic as kinematic
+from sfkd_jax.plants._kinematic import kinematic_stiff as kinematic_stiff
 from sfkd_jax.plants._own import check_step as check_step
 from sfkd_jax.plants._own import described as described
 from sfkd_jax.plants._own import on_host as on_host
 from sfkd_jax.plants._own import own as own
 from sfkd_jax.plants._own import simulator as simulator
-from sfkd_jax.plants._single_track import dynamic as dynamic
-from sfkd_jax.plants._single_track import kinematic as kinematic
-from sfkd_jax.plants._single_track import kinematic_stiff as kinematic_stiff
 from sfkd_jax.plants._vehicle import Vehicle as Vehicle
 from sfkd_jax.plants._vehicle import along_path as along_path
 from sfkd_jax.plants._vehicle import equivalent_wind as equivalent_wind

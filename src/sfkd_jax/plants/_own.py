@@ -1,4 +1,4 @@
-"""A vehicle of the user's own: a step function, any simulator, or logs alone."""
+"""Vehicles of the user: a step function, any simulator, or a vehicle in logs alone."""
 
 from __future__ import annotations
 
@@ -29,19 +29,23 @@ def own(
 
     Without a step a model of the vehicle can be learned and planned with, but the
     vehicle cannot be simulated. Its nominal model is the textbook kinematic bicycle on
-    (p_x, p_y, yaw, v), centre of mass in the middle; further states are constant.
+    (p_x, p_y, yaw, v), with the centre of mass in the middle. Further states are
+    constant in that model.
 
     Args:
         dt: sampling period [s].
         state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
-        control_low: lower limits of the actuators; () without a step, where the logs
-            give them.
-        control_high: upper limits of the actuators.
-        wheelbase: [m], for the nominal bicycle and the path-following law.
+        control_low: lower limits of the actuators. They may be () without a step: the
+            logs give them then.
+        control_high: upper limits of the actuators, or ().
+        wheelbase: of the nominal bicycle and of the path-following law [m].
         wind_force: c_w of `side_force` [N s²/m²]; 0 if e_2 is no wind.
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
             [m/s²].
         step: (x, u, e) -> x one sampling period later, pure and traceable by jax.
+
+    Raises:
+        ValueError: states or limits are missing.
     """
     if len(state_names) < 4:
         raise ValueError(
@@ -49,20 +53,20 @@ def own(
             f"got {', '.join(state_names) or 'none'}"
         )
     sizes = {len(control_low), len(control_high)}
-    # Without a step the limits may come later, from the logs.
-    if sizes != {2} and (sizes != {0} or step is not None):
+    without_limits = sizes == {0} and step is None
+    if sizes != {2} and not without_limits:
         raise ValueError(
             "vehicle.control_low and vehicle.control_high must be two numbers each, "
             "as in [-0.4,-3.0]"
         )
-    # The centre of mass in the middle: logs do not tell where it is.
+    # Logs do not tell where the centre of mass is. It is taken to be in the middle.
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase, states=len(state_names))
     return Vehicle(
         name="own",
         dt=dt,
         wheelbase=wheelbase,
         state_names=tuple(state_names),
-        # Fails when it is called: learning and planning do not simulate.
+        # `_no_step` fails only when it is called. Learning and planning do not call it.
         step=_no_step if step is None else step,
         nominal=rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
@@ -75,7 +79,7 @@ def own(
 
 
 def _no_step(state: State, control: Control, env: Environment) -> State:
-    """The step of a vehicle that is known from logs alone."""
+    """Refuse to simulate a vehicle that is known from logs alone."""
     raise ValueError(
         "vehicle=own is known from logs alone, so it cannot be simulated: "
         "pass vehicle.step=module:function or vehicle.env=module:simulator"
@@ -91,26 +95,38 @@ def simulator(make: Make) -> Vehicle:
         reset(state)              to any state, which then decides all that follows
         step(control, environment) -> state one period later
 
-    or an environment of gymnasium with `state_names` and `dt`, which is reset with
-    `options={"state": …, "environment": …}` before every step, and whose observation
-    begins with the state. Optional are settings of `own`, `workers` (copies, each in a
-    process of its own; by default one a core), `timeout_s` for a share of a batch, and
-    `environment_names` of the entries of e, with units.
+    or an environment of gymnasium with `state_names` and `dt`. It is reset with
+    `options={"state": …, "environment": …}` before every step, and its observation
+    begins with the state. These attributes are optional:
 
-    The step works under `jit`, `vmap` and `scan`, a batch at a time, without a
+        settings of `own`         as attributes of the same names
+        workers                   number of copies, each in a process of its own; by
+                                  default as many as there are cores
+        timeout_s                 for a worker's part of a batch
+        environment_names         of the entries of e, with units
+
+    The step works under `jit`, `vmap` and `scan`, a batch at a time, and has no
     gradient. If the simulator fails, the state is NaN, and a warning says why.
 
     Args:
         make: package.module:function, or a function that can be pickled.
+
+    Raises:
+        ValueError: the simulator cannot be made; gives the reason.
     """
-    return own(**described(make)[0], step=on_host(make))
+    settings, _ = described(make)
+    return own(**settings, step=on_host(make))
 
 
 def described(make: Make) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return settings of `own` and names of e that a simulator knows, or refuse it."""
-    about = dict(pool_of(make).about)
-    names = about.pop("environment_names")
-    return about, names
+    """Return the settings of `own` and the names of e that a simulator states.
+
+    Raises:
+        ValueError: the simulator cannot be made; gives the reason.
+    """
+    settings = dict(pool_of(make).settings)
+    environment_names = settings.pop("environment_names")
+    return settings, environment_names
 
 
 def on_host(make: Make) -> Step:
@@ -118,33 +134,44 @@ def on_host(make: Make) -> Step:
 
     def call(*inputs: Any) -> np.ndarray:
         batch = inputs[0].shape[:-1]
-        # In double precision, as simulators compute.
+        # Simulators compute in double precision.
         columns = [
-            np.asarray(each, float).reshape(-1, each.shape[-1]) for each in inputs
+            np.asarray(array, float).reshape(-1, array.shape[-1]) for array in inputs
         ]
         after = pool_of(make).step(np.concatenate(columns, axis=1))
         return after.reshape(*batch, -1).astype(inputs[0].dtype)
 
     def step(state: State, control: Control, env: Environment) -> State:
         shape = jax.ShapeDtypeStruct(state.shape, state.dtype)
-        inputs = state, control, env
         # One call for a whole batch, which the workers divide among themselves.
-        return jax.pure_callback(call, shape, *inputs, vmap_method="broadcast_all")
+        return jax.pure_callback(
+            call, shape, state, control, env, vmap_method="broadcast_all"
+        )
 
     return step
 
 
 def check_step(plant: Vehicle, environments: int = 2) -> None:
-    """Refuse a step that is missing, fails or returns no state, from shapes only."""
+    """Refuse a plant whose step is missing, fails, or does not return a state.
+
+    The step is traced with shapes alone; nothing is computed.
+
+    Args:
+        plant: to check.
+        environments: number of entries of e.
+
+    Raises:
+        ValueError: gives the reason.
+    """
     size = len(plant.state_names)
-    given = f"{size} states (vehicle.state_names), 2 controls and {environments} "
-    given += "environments"
     try:
         after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, environments)))
-    except Exception as reason:  # a function of the user raises anything
-        first = (str(reason).splitlines() or [type(reason).__name__])[0]
+    except Exception as reason:  # The step is the user's and may raise anything.
+        first_line = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
-            f"the step of vehicle {plant.name} fails on {given}: {first}"
+            f"the step of vehicle {plant.name} fails on {size} states "
+            f"(vehicle.state_names), 2 controls and {environments} environments: "
+            f"{first_line}"
         ) from None
     shape = getattr(after, "shape", type(after).__name__)
     if shape != (size,):

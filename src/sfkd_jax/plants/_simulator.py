@@ -1,6 +1,7 @@
 """Simulators that are not written in JAX: copies of one in worker processes.
 
-This file is also the program of a worker. It imports no jax, so that one starts fast.
+This file is also the program of a worker process. It does not import jax, so that a
+worker starts fast.
 """
 
 from __future__ import annotations
@@ -22,59 +23,73 @@ from typing import Any, TypeAlias
 import numpy as np
 
 Make: TypeAlias = str | Callable[[], Any]
-"""package.module:function or the function, which a worker calls for its copy."""
+"""A function that makes a simulator, or its name as package.module:function. Every
+worker calls it for a copy of its own.
+"""
 
-KNOWN = ("dt", "control_low", "control_high", "wheelbase", "wind_force", "speed_loop")
-"""What a simulator may say about its vehicle, besides `state_names`."""
+OPTIONAL_SETTINGS = (
+    "dt",
+    "control_low",
+    "control_high",
+    "wheelbase",
+    "wind_force",
+    "speed_loop",
+)
+"""Attributes of a simulator that describe its vehicle, besides `state_names`."""
 PATIENCE = 120.0
-"""Longest time to make a simulator and, unless it has `timeout_s`, to answer [s]."""
-SAID: set[tuple[Make, str]] = set()
-"""Faults that were warned about."""
+"""Longest time to make a simulator, and to answer where it has no `timeout_s` [s]."""
+WARNED: set[tuple[Make, str]] = set()
+"""Simulators and types of faults for which a warning was given already."""
 
 
 @cache
 def pool_of(make: Make) -> Pool:
-    """Return the workers of a simulator, which everybody in this process shares."""
+    """Return the workers of a simulator; all callers in this process share them."""
     return Pool(make)
 
 
 class Pool:
     """Copies of a simulator, each in a process of its own, which step many vehicles.
 
-    A step that raises, hangs, ends its process, or gives no finite state of the right
-    size, is NaN. Of each kind of fault the first is a warning.
+    The new state is NaN where a step raises, hangs, ends its process, or gives no
+    finite state of the right size. The first fault of each type is a warning.
 
     Attributes:
-        about: settings of the vehicle that the simulator knows.
+        settings: of the vehicle, as far as the simulator states them.
     """
 
     def __init__(self, make: Make) -> None:
-        """Start one worker; a ValueError says why the simulator cannot be made."""
+        """Start one worker.
+
+        Raises:
+            ValueError: the simulator cannot be made; gives the reason.
+        """
         first = _Worker(make)
-        self.about = first.start()
+        self.settings = first.start()
         # The other processes start when there is work for them.
-        more = self.about.pop("workers") - 1
-        self._workers = [first, *(_Worker(make) for _ in range(more))]
+        others = self.settings.pop("workers") - 1
+        self._workers = [first, *(_Worker(make) for _ in range(others))]
         self._lock = Lock()
 
     def step(self, rows: np.ndarray) -> np.ndarray:
         """Return the state one step after each row (state, control, environment)."""
-        states = np.full((len(rows), len(self.about["state_names"])), np.nan)
-        # A run that has ended stays NaN and costs nothing.
+        states = np.full((len(rows), len(self.settings["state_names"])), np.nan)
+        # A run that has ended stays NaN, and its rows are not simulated.
         alive = np.flatnonzero(np.isfinite(rows).all(axis=1))
-        taken = self._workers[: len(alive)]
-        parts = np.array_split(alive, max(len(taken), 1))
-        # Episodes of several threads take turns: a step is short beside their plans.
+        workers = self._workers[: len(alive)]
+        parts = np.array_split(alive, max(len(workers), 1))
+        # Threads with episodes of their own take turns. A step is short compared with
+        # the plans that they make in between.
         with self._lock:
-            for worker, part in zip(taken, parts, strict=False):
+            for worker, part in zip(workers, parts, strict=False):
                 worker.send(rows[part])
-            for worker, part in zip(taken, parts, strict=False):
+            for worker, part in zip(workers, parts, strict=False):
                 states[part] = worker.states(rows[part])
         return states
 
 
 class _Worker:
-    """One process; it is started when it is needed, and again when it is lost."""
+    """One process. It is started when it is needed, and again when it was lost."""
 
     def __init__(self, make: Make) -> None:
         self._make = make
@@ -82,13 +97,14 @@ class _Worker:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> dict[str, Any]:
-        """Start the process, and return what the simulator says about itself."""
+        """Start the process, and return the settings that the simulator states."""
         if self._process is not None:
             self._process.kill()
-        self._channel, theirs = Pipe()
-        number = theirs.fileno()
-        # A program, not a fork, in which jax would hang, and not a spawned copy of the
-        # caller's main program either. What it prints is no output of a command.
+        self._channel, worker_end = Pipe()
+        number = worker_end.fileno()
+        # A program of its own: jax would hang in a fork, and a spawned process would
+        # run the caller's main program again. What the worker prints goes to standard
+        # error, because it is no output of a command.
         self._process = subprocess.Popen(
             [sys.executable, __file__, str(number)],
             pass_fds=(number,),
@@ -96,45 +112,48 @@ class _Worker:
             stdout=2,
         )
         weakref.finalize(self, self._process.kill)
-        theirs.close()
+        worker_end.close()
         self.send(([path or os.getcwd() for path in sys.path], self._make))
-        about, faults = self._answer(PATIENCE)
+        settings, faults = self._answer(PATIENCE)
         if faults:
             raise ValueError(f"vehicle.env={self._make}: {faults[0]}")
-        self._patience = about.pop("timeout_s")
-        self._size = len(about["state_names"])
-        return about
+        self._patience = settings.pop("timeout_s")
+        self._size = len(settings["state_names"])
+        return settings
 
-    def send(self, what: Any) -> None:
-        """Ask for something; that the process is gone is noticed by its answer."""
+    def send(self, request: Any) -> None:
+        """Send a request to the process, which is started if there is none.
+
+        If the process is gone, this is noticed when its answer is read.
+        """
         if self._process is None:
             self.start()
         with suppress(OSError):
-            self._channel.send(what)
+            self._channel.send(request)
 
     def states(self, rows: np.ndarray) -> Any:
         """Return the states one step after the rows that were sent."""
         states, faults = self._answer(self._patience)
         if states is None:
             self.start()
-            # One by one, so that only the row at fault is lost.
+            # Every row is sent again alone, so that only the row at fault is lost.
             if len(rows) > 1:
-                return np.concatenate([self._alone(row[None]) for row in rows])
+                return np.concatenate([self._states_of_row(row[None]) for row in rows])
             states = np.full((1, self._size), np.nan)
         for fault in faults:
-            # Its kind, not its numbers, which differ at every step.
-            kind = self._make, fault.partition(":")[0]
-            if kind not in SAID:
-                SAID.add(kind)
+            # The type of the fault, without its numbers, which differ at every step.
+            fault_type = (self._make, fault.partition(":")[0])
+            if fault_type not in WARNED:
+                WARNED.add(fault_type)
                 warnings.warn(f"simulator {self._make}: {fault}", stacklevel=2)
         return states
 
-    def _alone(self, row: np.ndarray) -> Any:
+    def _states_of_row(self, row: np.ndarray) -> Any:
         self.send(row)
         return self.states(row)
 
     def _answer(self, seconds: float) -> tuple[Any, list[str]]:
-        """The answer and faults; None if the process hangs or has ended."""
+        """Return answer and faults; the answer is None if the process hangs or died."""
         try:
             if self._channel.poll(seconds):
                 return self._channel.recv()
@@ -153,7 +172,7 @@ class _Environment:
         self.control_high = limits.high
 
     def __getattr__(self, name: str) -> Any:
-        """What describes the vehicle is below the wrappers of gymnasium."""
+        """Attributes that describe the vehicle are below the wrappers of gymnasium."""
         return getattr(self._env.unwrapped, name)
 
     def reset(self, state: Any) -> None:
@@ -167,23 +186,28 @@ class _Environment:
         return observation
 
 
-def _about(simulator: Any) -> dict[str, Any]:
-    """What a simulator says about itself, as plain numbers and words."""
-    about: dict[str, Any] = {"timeout_s": PATIENCE, "workers": os.cpu_count() or 1}
+def _settings_of(simulator: Any) -> dict[str, Any]:
+    """Return the settings that a simulator states, as plain numbers and words."""
     if hasattr(os, "sched_getaffinity"):
-        about["workers"] = len(os.sched_getaffinity(0))
-    for name in (*KNOWN, *about):
-        if (value := getattr(simulator, name, None)) is not None:
-            kind = {"workers": int, "speed_loop": bool}.get(name, float)
-            plain = np.asarray(value, kind).tolist()
-            about[name] = tuple(plain) if isinstance(plain, list) else plain
-    names = {"environment_names": getattr(simulator, "environment_names", ())}
-    names |= {"state_names": simulator.state_names}
-    return about | {name: tuple(map(str, each)) for name, each in names.items()}
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    settings: dict[str, Any] = {"timeout_s": PATIENCE, "workers": cores}
+    for name in (*OPTIONAL_SETTINGS, *settings):
+        value = getattr(simulator, name, None)
+        if value is None:
+            continue
+        number_type = {"workers": int, "speed_loop": bool}.get(name, float)
+        plain = np.asarray(value, number_type).tolist()
+        settings[name] = tuple(plain) if isinstance(plain, list) else plain
+    environment_names = getattr(simulator, "environment_names", ())
+    settings["environment_names"] = tuple(map(str, environment_names))
+    settings["state_names"] = tuple(map(str, simulator.state_names))
+    return settings
 
 
 def _serve(channel: Connection) -> None:
-    """Make a simulator, then step what is asked for until nobody asks any more."""
+    """Make a simulator, then answer requests for steps until the channel is closed."""
     try:
         sys.path[:], make = channel.recv()
         if isinstance(make, str):
@@ -192,12 +216,12 @@ def _serve(channel: Connection) -> None:
         simulator = make()
         if hasattr(simulator, "action_space"):
             simulator = _Environment(simulator)
-        about = _about(simulator)
-    except Exception as reason:  # code of the user raises anything
+        settings = _settings_of(simulator)
+    except Exception as reason:  # The code is the user's and may raise anything.
         channel.send((None, [_line(reason)]))
         return
-    channel.send((about, []))
-    size = len(about["state_names"])
+    channel.send((settings, []))
+    size = len(settings["state_names"])
     while True:
         rows = channel.recv()
         faults = []
@@ -216,6 +240,7 @@ def _serve(channel: Connection) -> None:
 
 
 def _line(reason: Exception) -> str:
+    """Return the type of an exception and the first line of its message."""
     first = (str(reason).splitlines() or [""])[0]
     return f"{type(reason).__name__}: {first}"
 
