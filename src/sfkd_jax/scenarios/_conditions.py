@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,25 +13,31 @@ from sfkd_jax.types import Environment, Key, Scalar
 Range = tuple[float, float]
 Corner = tuple[float, ...] | Environment
 Schedule = Float[Array, "time 2"]
+"""Friction [-] and side wind [m/s] over time."""
 
 SWITCH_LEVELS = ((0.9, 0.0), (0.6, 4.0), (0.3, 8.0), (0.6, 4.0))
-"""S3's order A, B, C, B, A, …: (friction, |wind|)."""
+"""Levels (friction [-], |wind| [m/s]) of S3 in their order A, B, C, B, then A again."""
 SWITCH_PERIOD = 3.0
-"""Between two switches of S3 [s]."""
+"""Time between two switches of S3 [s]."""
 PEAK_WIND = 8.0
 """Largest gust of S2 [m/s]."""
 BOX = ((0.3, -PEAK_WIND), (0.9, PEAK_WIND))
-"""The environments of the benchmark, which levels and ranges are about."""
-HOLD, RAMP = (1.0, 3.0), 0.5
-"""Of gusts: range of the time from one ramp to the next, and its duration [s]."""
+"""Lower and upper corner of the environments of the benchmark. All levels and ranges of
+its schedules lie in this box.
+"""
+GUST_HOLD = (1.0, 3.0)
+"""Range of the time from the start of one gust to that of the next [s]."""
+GUST_RAMP = 0.5
+"""Time in which the wind changes at the start of a gust [s]."""
 
 
 def uniform_road(key: Key, *, steps: int, friction: Range = (0.9, 0.9)) -> Schedule:
-    """S1: one friction level from a range, no wind.
+    """Draw S1: one friction level from a range for the whole time, and no wind.
 
     Args:
-        steps: length.
-        friction: range [-].
+        key: consumed.
+        steps: number of time steps.
+        friction: range of the level [-].
     """
     level = within(friction, key)
     return jnp.stack([jnp.full(steps, level), jnp.zeros(steps)], axis=1)
@@ -44,10 +52,11 @@ def wet_road(
     after: Range = (0.35, 0.35),
     drop_time: Range = (5.0, 5.0),
 ) -> Schedule:
-    """S2: friction drops abruptly once, while smooth gusts blow.
+    """Draw S2: friction drops abruptly once, while smooth gusts blow.
 
     Args:
-        steps: length.
+        key: consumed.
+        steps: number of time steps.
         dt: sampling period [s].
         before: range of the friction before the drop [-].
         after: range of the friction after it [-].
@@ -56,36 +65,39 @@ def wet_road(
     before_key, after_key, time_key, gust_key = jax.random.split(key, 4)
     high = within(before, before_key)
     low = within(after, after_key)
-    # A hair early: k dt may round to just below the time of the drop.
+    # 1e-6 s, because k dt may round to just below the time of the drop.
     dry = jnp.arange(steps) * dt < within(drop_time, time_key) - 1e-6
     wind = gusts(gust_key, steps=steps, dt=dt, peak=PEAK_WIND)
     return jnp.stack([jnp.where(dry, high, low), wind], axis=1)
 
 
 def switching_road(key: Key, *, steps: int, dt: float) -> Schedule:
-    """S3: the next of the levels A, B, C, B, A, … every period, wind side random.
+    """Draw S3: the next of `SWITCH_LEVELS` every period, with wind from a random side.
 
     Args:
-        steps: length.
+        key: consumed.
+        steps: number of time steps.
         dt: sampling period [s].
     """
-    # One visit more, for the rest of a period at the end.
+    # One visit more than there are full periods, for the part of one at the end.
     visits = int(steps * dt / SWITCH_PERIOD) + 1
     sides = jax.random.rademacher(key, (visits,), dtype=float)
     levels = jnp.asarray(SWITCH_LEVELS)[jnp.arange(visits) % len(SWITCH_LEVELS)]
     # Friction is the first column and has no side.
     levels = levels.at[:, 1].multiply(sides)
-    # The same hair, so that a period has the same number of steps each time.
+    # 1e-6, so that rounding does not change the number of steps from period to period.
     visit = jnp.floor(jnp.arange(steps) * dt / SWITCH_PERIOD + 1e-6).astype(int)
     return levels[visit]
 
 
 def in_box(envs: Schedule, low: Corner, high: Corner) -> Float[Array, "time env"]:
-    """Move a schedule of the benchmark to another box, at the same shares of its ends.
+    """Move a schedule of the benchmark from `BOX` to another box of environments.
 
-    The first entry takes the place of the friction, from its lower to its upper end;
-    all others that of the wind: to both sides if 0 lies inside their range, else from
-    the lower end on. In the benchmark's own box nothing changes, not a bit.
+    The first entry of the new environment takes the place of the friction: it is at the
+    same share of the way from its lower to its upper end. All other entries take the
+    place of the wind, as a share of `PEAK_WIND`. If 0 lies inside the range of such an
+    entry, it goes to both sides of 0, otherwise from its lower end upwards. For `BOX`
+    itself the schedule is returned unchanged, to the last bit.
 
     Args:
         envs: (friction, wind) over time.
@@ -98,51 +110,54 @@ def in_box(envs: Schedule, low: Corner, high: Corner) -> Float[Array, "time env"
     wind = jnp.repeat(envs[:, 1:] / PEAK_WIND, len(low) - 1, axis=1)
     bottom = jnp.asarray(low)
     top = jnp.asarray(high)
-    sided = (bottom < 0.0) & (top > 0.0)
-    from_zero = jnp.where(wind < 0.0, -wind * bottom[1:], wind * top[1:])
-    from_end = bottom[1:] + jnp.abs(wind) * (top - bottom)[1:]
     first = bottom[:1] + grip * (top - bottom)[:1]
-    return jnp.concatenate([first, jnp.where(sided[1:], from_zero, from_end)], axis=1)
+    spans_zero = (bottom < 0.0) & (top > 0.0)
+    from_zero = jnp.where(wind < 0.0, -wind * bottom[1:], wind * top[1:])
+    from_low_end = bottom[1:] + jnp.abs(wind) * (top - bottom)[1:]
+    others = jnp.where(spans_zero[1:], from_zero, from_low_end)
+    return jnp.concatenate([first, others], axis=1)
 
 
 def random_side_forces(
     key: Key, *, steps: int, dt: float, largest: float | Scalar, hold: float = 1.0
 ) -> Float[Array, " time"]:
-    """Draw unmeasured side forces, uniform in [-F, F], each constant for a while [N].
+    """Draw side forces that nobody measures, uniform in [-F, F] [N].
 
     Args:
-        key: consumed; the same key gives the same forces at every F, up to the factor.
-        steps: length.
+        key: consumed. With the same key, the forces are the same shares of every F.
+        steps: number of time steps.
         dt: sampling period [s].
         largest: F [N].
-        hold: duration of a level [s].
+        hold: time for which a force stays constant [s].
     """
-    # In whole steps: a force that changed within a step would not be held by it.
-    each = round(hold / dt)
-    # Shares of F: the same pushes at every size.
-    levels = jax.random.uniform(key, (-(-steps // each),), minval=-1.0)
-    return largest * jnp.repeat(levels, each)[:steps]
+    # In whole steps: the plant holds its inputs during a step.
+    hold_steps = round(hold / dt)
+    count = -(-steps // hold_steps)
+    shares = jax.random.uniform(key, (count,), minval=-1.0)
+    return largest * jnp.repeat(shares, hold_steps)[:steps]
 
 
 def gusts(key: Key, *, steps: int, dt: float, peak: float) -> Float[Array, " time"]:
     """Draw wind levels, uniform in [-peak, peak], joined by 1 − cos ramps [m/s].
 
     Args:
-        steps: length.
+        key: consumed.
+        steps: number of time steps.
         dt: sampling period [s].
-        peak: [m/s].
+        peak: largest wind [m/s].
     """
     level_key, hold_key = jax.random.split(key)
-    # Enough for the shortest holds; what is beyond the end is not used.
-    count = int(steps * dt / HOLD[0]) + 2
+    # Enough even if all times between gusts are the shortest. The rest is not used.
+    count = int(steps * dt / GUST_HOLD[0]) + 2
     levels = within((-peak, peak), level_key, count + 1)
-    starts = jnp.cumsum(within(HOLD, hold_key, count))
+    starts = jnp.cumsum(within(GUST_HOLD, hold_key, count))
     time = jnp.arange(steps) * dt
     gust = jnp.searchsorted(starts, time, side="right")
-    # Before the first ramp the level is that of gust 0, as if its ramp were over.
-    since = time - jnp.where(gust > 0, starts[gust - 1], -RAMP)
-    blend = 0.5 - 0.5 * jnp.cos(jnp.pi * jnp.clip(since / RAMP, 0.0, 1.0))
-    # Gust 0 has none before it, and a negative index would wrap to the last.
+    # Gust 0 blows from the beginning: its ramp counts as over at time 0.
+    since_start = time - jnp.where(gust > 0, starts[gust - 1], -GUST_RAMP)
+    ramp = jnp.clip(since_start / GUST_RAMP, 0.0, 1.0)
+    blend = 0.5 - 0.5 * jnp.cos(jnp.pi * ramp)
+    # No gust comes before gust 0, and a negative index would wrap to the last one.
     before = levels[jnp.maximum(gust - 1, 0)]
     return before + (levels[gust] - before) * blend
 
@@ -150,12 +165,13 @@ def gusts(key: Key, *, steps: int, dt: float, peak: float) -> Float[Array, " tim
 def held_road(
     key: Key, *, steps: int, low: tuple[float, ...], high: tuple[float, ...]
 ) -> Float[Array, "time environment"]:
-    """One constant environment from the box E.
+    """Draw one environment from the box E, for the whole time.
 
     Each entry is uniform in its range or, with probability 1/3, at one of its ends.
 
     Args:
-        steps: length.
+        key: consumed.
+        steps: number of time steps.
         low: lower corner of E, in units of e.
         high: upper corner of E.
     """
@@ -171,21 +187,21 @@ def random_switching(
     high: Corner,
     dwell: Range = (3.0, 6.0),
 ) -> Float[Array, "time environment"]:
-    """Environments from the box E, as in `held_road`, each held for some time.
+    """Draw environments from the box E as `held_road` does, each held for some time.
 
     Args:
-        steps: length.
+        key: consumed.
+        steps: number of time steps.
         dt: sampling period [s].
         low: lower corner of E, (environment,), in units of e.
         high: upper corner of E.
         dwell: range of the time between two switches [s].
     """
     level_key, hold_key = jax.random.split(key)
-    # One level more than the shortest dwells need.
+    # Enough even if every environment is held for the shortest time.
     count = int(steps * dt / dwell[0]) + 2
-    levels = jax.vmap(lambda key: _from_box(key, low, high))(
-        jax.random.split(level_key, count)
-    )
+    from_box = partial(_from_box, low=low, high=high)
+    levels = jax.vmap(from_box)(jax.random.split(level_key, count))
     ends = jnp.cumsum(within(dwell, hold_key, count))
     return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
 
@@ -193,13 +209,16 @@ def random_switching(
 def within(
     bounds: tuple[float | Scalar, float | Scalar], key: Key, *shape: int
 ) -> Float[Array, "*shape"]:
-    """Draw uniformly from a range."""
+    """Draw an array of the given shape, uniform in a range."""
     return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
 
 
 def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
-    """A point of a box; each entry is at an end of its range with probability 1/3."""
-    # A wider range, clipped: the ends, where models are worst, are drawn often.
+    """Draw a point of a box; each entry is at an end of its range with probability 1/3.
+
+    The ends are drawn so often because models are worst there.
+    """
+    # A sixth of the wider range lies beyond each end, and is clipped to it.
     share = jnp.clip(within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
     bottom = jnp.asarray(low)
     top = jnp.asarray(high)

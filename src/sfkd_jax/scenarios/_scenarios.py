@@ -1,10 +1,10 @@
-"""Scenario families: key -> start, environment, path and obstacles of one episode."""
+"""Families of scenarios: start, environment, path and obstacles of random episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,17 +25,17 @@ from sfkd_jax.scenarios._conditions import (
 from sfkd_jax.types import Key, Scalar, State
 
 RUN_UP = 20.0
-"""Over which the curvature of a path is blended in [m]."""
+"""Length over which the curvature of a path is blended in [m]."""
 FIRST = 70.0
-"""Arc length of the first obstacle at the earliest [m]: out of sight at the start."""
+"""Smallest arc length of the first obstacle [m]. It is out of sight at the start."""
 GAP = (40.0, 60.0)
 """Range of the distance from one obstacle to the next [m]."""
 PASSED = 15.0
-"""Distance behind the car at which an obstacle is out of its way [m]."""
+"""Distance behind the car from which on an obstacle counts as passed [m]."""
 CAR = (2.25, 1.0)
 """Half of length and width of the car [m]."""
 IN_VIEW = 4
-"""Most obstacles that a controller is shown, the ones that are passed next."""
+"""Number of obstacles that a controller is shown: those that are passed next."""
 
 
 class Course(NamedTuple):
@@ -44,8 +44,8 @@ class Course(NamedTuple):
     Attributes:
         lane: with its path.
         obstacles: all of them, in the order in which they are passed.
-        along: arc length of the path beside each [m], rising, (obstacle,).
-        view: distance along the path from which each is seen [m], (obstacle,).
+        along: arc length of the path beside each obstacle [m], rising, (obstacle,).
+        view: distance along the path from which on each is seen [m], (obstacle,).
     """
 
     lane: Lane
@@ -57,16 +57,17 @@ class Course(NamedTuple):
 def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
     """Draw obstacles up to 1.5 m beside a path, of radius 0.8 m, seen from 60 m on.
 
-    The lane is as wide as three, so that the car may pass each of them on either side.
+    The lane is three usual lanes wide, so that the car may pass each obstacle on either
+    side.
 
     Args:
         key: consumed.
-        path: open; its last 50 m stay free.
-        speed: wanted [m/s].
+        path: open. Its last 50 m stay free.
+        speed: wanted speed on the lane [m/s].
     """
     gap_key, offset_key = jax.random.split(key)
     length = (path.points.shape[0] - 1) * SPACING
-    # As many as the shortest gaps need, and no less than are shown at once.
+    # Enough even if all gaps are the shortest, and no fewer than are shown at once.
     count = max(int((length - FIRST) / GAP[0]), IN_VIEW)
     along = FIRST - GAP[0] + jnp.cumsum(within(GAP, gap_key, count))
     aside = within((-1.5, 1.5), offset_key, count)
@@ -79,14 +80,20 @@ def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
 def beside(
     path: Path, along: Float[Array, " place"], aside: Float[Array, " place"]
 ) -> Float[Array, "place 2"]:
-    """Return positions at arc lengths and distances to the left of a path [m]."""
-    point = jax.vmap(point_at, in_axes=(None, 0))(path, along)
-    normal = jnp.stack([-jnp.sin(point[:, 2]), jnp.cos(point[:, 2])], axis=1)
-    return point[:, :2] + aside[:, None] * normal
+    """Return the positions beside a path [m].
+
+    Args:
+        path: that they are beside.
+        along: arc lengths [m].
+        aside: distances to the left of the path [m].
+    """
+    points = jax.vmap(point_at, in_axes=(None, 0))(path, along)
+    normals = jnp.stack([-jnp.sin(points[:, 2]), jnp.cos(points[:, 2])], axis=1)
+    return points[:, :2] + aside[:, None] * normals
 
 
 def in_view(course: Course, progress: Scalar) -> Obstacles:
-    """Return what a car sees: of the obstacles to pass, the next `IN_VIEW`.
+    """Return the next `IN_VIEW` obstacles; those that are out of sight are not present.
 
     Args:
         course: with at least as many obstacles, present or not.
@@ -95,15 +102,17 @@ def in_view(course: Course, progress: Scalar) -> Obstacles:
     ahead = course.along - progress
     first = jnp.clip(jnp.sum(ahead < -PASSED), 0, course.along.shape[0] - IN_VIEW)
     present = course.obstacles.present & (ahead <= course.view)
-    seen = course.obstacles._replace(present=present)
-    # A window of constant size: a controller is compiled once for all courses.
-    return jax.tree.map(
-        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, IN_VIEW), seen
+    obstacles = course.obstacles._replace(present=present)
+    # The window has a constant size, so that a controller is compiled once for all
+    # courses.
+    window = partial(
+        jax.lax.dynamic_slice_in_dim, start_index=first, slice_size=IN_VIEW
     )
+    return jax.tree.map(window, obstacles)
 
 
 def car_clearance(obstacles: Obstacles, state: State) -> Scalar:
-    """Return how far a car, a box of `CAR`, is from the nearest obstacle now [m]."""
+    """Return how far a car of size `CAR` is from the nearest obstacle now [m]."""
     direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
     return jnp.min(clearance(obstacles, state[:2], direction=direction, half=CAR))
 
@@ -114,10 +123,12 @@ class Scenario(NamedTuple):
     Attributes:
         initial_state: x_0.
         envs: e_0 … e_{T-1} that the plant is in, (time, environment).
-        observed_envs: the same as the controller observes it, (time, environment).
+        observed_envs: e_0 … e_{T-1} as the controller observes them, (time,
+            environment).
         path: to follow.
         speed: to hold [m/s].
-        course: obstacles on the path, or None: the path is to be followed.
+        course: obstacles on the path, or None. With obstacles the car has to stay in
+            the lane of the course, without it has to follow the path.
     """
 
     initial_state: State
@@ -129,17 +140,28 @@ class Scenario(NamedTuple):
 
 
 Family: TypeAlias = Callable[[Key], Scenario]
+"""A family of scenarios: every key gives another scenario."""
+
+
+def _dry_road(key: Key, *, steps: int, dt: float) -> Schedule:
+    """S1, whose environment is constant; dt is not needed."""
+    del dt
+    return uniform_road(key, steps=steps)
 
 
 ROADS: dict[str, Callable[..., Schedule]] = {
-    "s1": lambda key, steps, dt: uniform_road(key, steps=steps),
+    "s1": _dry_road,
     "s2": wet_road,
     "s3": switching_road,
     "obstacles": switching_road,
 }
-"""Scenarios by name -> (key, steps=, dt=sampling period [s]) -> e_0 … e_{T-1}."""
+"""Schedules of the environment by the name of the scenario. Each is called with (key,
+steps=number of time steps, dt=sampling period [s]) and returns e_0 … e_{T-1}.
+"""
 COURSES: dict[str, Callable[..., Course]] = {"obstacles": random_course}
-"""Those with obstacles -> (key, path, speed=v [m/s]) -> obstacles on the path."""
+"""Obstacles by the name of the scenario, for those scenarios that have any. Each is
+called with (key, path, speed=v [m/s]) and returns a course on the path.
+"""
 
 
 def scenario(
@@ -167,24 +189,29 @@ def scenario(
         dt: sampling period [s].
         env_low: lower corner of E, see `in_box`.
         env_high: upper corner of E.
+
+    Raises:
+        ValueError: no scenario has this name.
     """
     if name not in ROADS:
         raise ValueError(f"unknown scenario {name!r}; choose one of {', '.join(ROADS)}")
-    # round: duration / dt may fall just below the whole number of steps.
-    road = ROADS[name]
+    schedule = ROADS[name]
+    # `round`, because duration / dt may fall just below the whole number of steps.
     steps = round(duration / dt)
-    # Longer than the distance by a tenth and a horizon: no plan meets its end.
-    length = speed * duration * 1.1 + 50.0
-
-    bends: Any = {"peak_curvature": peak_curvature, "wavelengths": wavelengths}
-    path = partial(smooth_path, length=length, **bends)
+    paths = partial(
+        smooth_path,
+        # Longer than the distance by a tenth and a horizon, so that no plan meets the
+        # end of the path.
+        length=speed * duration * 1.1 + 50.0,
+        peak_curvature=peak_curvature,
+        wavelengths=wavelengths,
+    )
+    courses = partial(COURSES[name], speed=speed) if name in COURSES else None
 
     def conditions(key: Key) -> Float[Array, "time environment"]:
-        return in_box(road(key, steps=steps, dt=dt), env_low, env_high)
+        return in_box(schedule(key, steps=steps, dt=dt), env_low, env_high)
 
-    course = COURSES.get(name)
-    course = course and partial(course, speed=speed)
-    return family(conditions, path, course, speed=speed, state_size=state_size)
+    return family(conditions, paths, courses, speed=speed, state_size=state_size)
 
 
 def family(
@@ -195,20 +222,35 @@ def family(
     speed: float,
     state_size: int,
 ) -> Family:
-    """Combine conditions, paths from the origin along x, and obstacles on them."""
+    """Return the family that combines conditions, paths and obstacles on them.
+
+    Args:
+        conditions: key -> e_0 … e_{T-1}.
+        paths: key -> path that starts at the origin along x.
+        courses: (key, path) -> obstacles on the path; None for none.
+        speed: to hold [m/s].
+        state_size: of the vehicle.
+    """
 
     def sample(key: Key) -> Scenario:
         course_key = key
         if courses is not None:
             key, course_key = jax.random.split(key)
-        # A key each: other conditions leave the path of an episode as it is.
+        # Path and conditions have separate keys: in other conditions an episode still
+        # has the same path.
         path_key, condition_key = jax.random.split(key)
-        start = jnp.zeros(state_size).at[3].set(speed)
         envs = conditions(condition_key)
         path = paths(path_key)
-        course = courses and courses(course_key, path)
-        # The controller observes the truth; a measurement error replaces this field.
-        return Scenario(start, envs, envs, path, jnp.asarray(speed), course)
+        return Scenario(
+            initial_state=jnp.zeros(state_size).at[3].set(speed),
+            envs=envs,
+            # The controller observes the truth. Evaluation replaces this field where
+            # its measurements are to have errors.
+            observed_envs=envs,
+            path=path,
+            speed=jnp.asarray(speed),
+            course=None if courses is None else courses(course_key, path),
+        )
 
     return sample
 
@@ -224,7 +266,7 @@ def smooth_path(
 
         κ(s) = Σᵢ aᵢ sin(2π s/λᵢ + φᵢ),   max |κ| = κ_max
 
-    It is blended in over the first metres, so that an episode starts on the path.
+    It is blended in over the first metres, so that an episode can start straight ahead.
 
     Args:
         key: consumed.
@@ -234,14 +276,14 @@ def smooth_path(
     """
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
     s = jnp.arange(int(length / SPACING) + 2) * SPACING
-    # At least 0.3, or one sinusoid could be left alone.
+    # At least 0.3, so that no sinusoid vanishes.
     amplitudes = within((0.3, 1.0), amplitude_key, 3, 1)
     waves = within(wavelengths, wavelength_key, 3, 1)
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
     blend = jnp.clip(s / RUN_UP, 0.0, 1.0)
-    # Smoothstep: the curvature and its slope start at 0, as does the steering.
+    # Smoothstep: the curvature and its slope start at 0, as the steering does.
     curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
-    # After the blend, so that the peak is reached on the path that is driven.
+    # Scaled after the blend, so that the path itself reaches the peak.
     curvature = curvature * peak_curvature / jnp.max(jnp.abs(curvature))
     return path_from_curvature(curvature, spacing=SPACING)
