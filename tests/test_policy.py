@@ -13,12 +13,12 @@ import pytest
 from helpers import same, straight
 
 import sfkd_jax
-from sfkd_jax import control, demo, policy
+from sfkd_jax import control, policy
 from sfkd_jax.types import Controller
 
 KEY, ENV = jax.random.key(0), jnp.asarray([0.7, 0.0])
-VEHICLES = sorted(entry.name for entry in demo.SHIPPED.iterdir())
-load = cache(lambda name, **options: policy.load(demo.SHIPPED / name, **options))
+VEHICLES = sorted(entry.name for entry in policy.SHIPPED.iterdir())
+load = cache(lambda name, **options: policy.load(policy.SHIPPED / name, **options))
 
 
 def start(vehicle):
@@ -93,7 +93,7 @@ def test_arguments_of_another_shape_are_refused_by_name(vehicle):
 )
 def test_what_the_caller_asked_for_is_not_blamed_on_the_file(options, message):
     with pytest.raises(ValueError, match=message):
-        policy.load(demo.SHIPPED / "kinematic", **options)
+        policy.load(policy.SHIPPED / "kinematic", **options)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_strict_numerics_of_the_caller_reach_no_policy(setting, value, caplog):
     policy._trained._built_from_json.cache_clear()
     inputs = start("kinematic"), ENV, straight(20)
     with getattr(jax, setting)(value), jax.log_compiles():
-        trained = policy.load(demo.SHIPPED / "kinematic_path")
+        trained = policy.load(policy.SHIPPED / "kinematic_path")
         state, act = trained.controller.init(KEY), trained.controller.act
         jax.eval_shape(act, trained.params, state, *inputs)
     assert 3 <= sum("XLA compilation of" in text for text in caplog.messages) <= 5

@@ -1,0 +1,160 @@
+"""What a certificate says about a controller: its corridor, and where it applies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sfkd_jax import control, plants
+from sfkd_jax.geometry import HEADING, LATERAL
+from sfkd_jax.types import Controller, Model
+
+ROAD_MARGIN = 0.05
+"""Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
+computed from its points.
+"""
+STATE_MARGIN = 0.25
+"""Relative enlargement of the box of ξ: the runs on which a corridor is calibrated
+leave the box of the data as well.
+"""
+ALLOWANCE = 3.0
+"""Standard deviations of a measured position by which the tube is enlarged."""
+Corner = Sequence[float] | None
+"""Lower or upper ends of the environment box E, if they are known."""
+
+
+def corridor_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the corridor of a certificate.
+
+    Its bounds are those of recorded runs, if the certificate has any.
+    """
+    recorded = certificate.get("recorded", {})
+    measured = ("bounds", "corridor_m", "level")
+    from_runs = {name: recorded[name] for name in measured if name in recorded}
+    return {**certificate["corridor"], **from_runs}
+
+
+def is_claimed(certificate: Mapping[str, Any]) -> bool:
+    """Return whether a corridor was measured on the vehicle, not on a model of logs."""
+    identified = "identified_from" in certificate["corridor"]["conditions"]
+    return not identified or "recorded" in certificate
+
+
+def in_corridor(
+    planner: Controller,
+    model: Model,
+    plant: plants.Vehicle,
+    law: control.PathLaw,
+    certificate: Mapping[str, Any],
+) -> Controller:
+    """Return the planner with a shield that keeps the corridor of a certificate.
+
+    Args:
+        planner: any controller along a path, see `control.along_reference`.
+        model: in path coordinates.
+        plant: vehicle, whose limits the controls keep.
+        law: around which the model was learned.
+        certificate: with a corridor.
+    """
+    corridor = corridor_of(certificate)
+    bounds = corridor["bounds"]
+    lateral_noise, heading_noise = _sensor_noise(corridor)
+    # What the heading's noise moves the car sideways until the law has turned it back.
+    steering = np.asarray(law.gain)[..., 0, :]
+    ratio = float(np.max(steering[..., HEADING] / steering[..., LATERAL]))
+    return control.Shield(
+        inner=planner,
+        model=model,
+        law=law,
+        width=bounds["nominal"],
+        tube=bounds["vehicle_to_nominal_position"],
+        horizon=corridor["shield_horizon"],
+        noise_allowance=ALLOWANCE * lateral_noise,
+        start_error=ALLOWANCE * (lateral_noise + ratio * heading_noise),
+        decay=certificate["alpha"],
+        control=(plant.control_low, plant.control_high),
+        conditions=conditions_of(certificate),
+        dt=plant.dt,
+        rear=_slip_of_gentle_turns(law),
+        claimed=is_claimed(certificate),
+    ).controller()
+
+
+def _slip_of_gentle_turns(law: control.PathLaw) -> float:
+    """Return the slip of a turn that the tyres hardly feel, per curvature [m].
+
+    At one lateral acceleration ψ* differs between two speeds by this times κ alone.
+    """
+    last = law.state.shape[0] - 1
+    # The gentlest turn of the table that is one.
+    row = min(last // 2 + 1, last)
+    heading = np.asarray(law.state)[row, ..., HEADING]
+    slow = np.asarray(law.low, float)[1]
+    side, fast, *_ = np.asarray(law.high, float)
+    sideways = side * (2.0 * row / last - 1.0)
+    curvatures = sideways / slow**2 - sideways / fast**2
+    return max(float(np.median(heading[-1] - heading[0]) / curvatures), 0.0)
+
+
+def _sensor_noise(corridor: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the standard deviations of the measured e_y [m] and e_ψ [rad]."""
+    noise = (*corridor["conditions"]["sensor_noise"], 0.0, 0.0, 0.0)
+    # The larger entry of a position: which one is lateral depends on the road.
+    return max(noise[:2]), noise[2]
+
+
+def conditions_of(
+    certificate: Mapping[str, Any] | None,
+    *,
+    env_low: Corner = None,
+    env_high: Corner = None,
+) -> control.Conditions:
+    """Return where the model predicts, as its certificate says.
+
+    Without a certificate nothing is known of this but the box of e.
+    """
+    if certificate:
+        return _certified_conditions(certificate)
+    if env_low is None or env_high is None:
+        return control.Conditions()
+    return control.Conditions(env=_box(env_low, env_high))
+
+
+def _certified_conditions(certificate: Mapping[str, Any]) -> control.Conditions:
+    """Return the boxes of a certificate, somewhat enlarged.
+
+    The box of e_y contains the corridor, since the claim holds there, whether or not
+    the data reach that far. The other boxes are those of the data, somewhat enlarged:
+    the runs on which a corridor is calibrated leave them as well.
+    """
+    boxes = certificate["boxes"]
+    low, high = (np.asarray(side, float) for side in boxes["state"])
+    margin = STATE_MARGIN * (high - low)
+    margin[LATERAL] = 0.0
+    low = low - margin
+    high = high + margin
+    edge = 0.0
+    if certificate.get("corridor"):
+        corridor = corridor_of(certificate)
+        lateral_noise, _ = _sensor_noise(corridor)
+        edge = corridor["corridor_m"] + ALLOWANCE * lateral_noise
+    low[LATERAL] = min(low[LATERAL], -edge)
+    high[LATERAL] = max(high[LATERAL], edge)
+    # [2:] are κ and v_ref; ν has its limits in the law.
+    road_low, road_high = np.asarray(boxes["control"], float)[:, 2:]
+    env_low, env_high = boxes["env"]
+    return control.Conditions(
+        env=_box(env_low, env_high),
+        state=_box(low, high),
+        road=_box(
+            road_low - ROAD_MARGIN * np.abs(road_low),
+            road_high + ROAD_MARGIN * np.abs(road_high),
+        ),
+    )
+
+
+def _box(low: Any, high: Any) -> control.Box:
+    """Return limits as plain numbers."""
+    return tuple(map(float, low)), tuple(map(float, high))
