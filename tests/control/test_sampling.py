@@ -6,20 +6,19 @@ import numpy as np
 import pytest
 
 from sfkd_jax import control
-from sfkd_jax.control.planners._sampling import (
-    KINDS,
-    SamplingPlanner,
+from sfkd_jax.control.planners._mppi import (
     effective_sample_size,
     savitzky_golay,
     shrunk,
     softmin,
     temperature_for,
 )
+from sfkd_jax.control.planners._sampling import NOISE_KINDS, SamplingPlanner
 
 HORIZON, SAMPLES = 20, 4000
 STD = jnp.asarray([0.5, 2.0])
 TASK = control.free_task(lambda *_: _, lambda *_: _)
-every = pytest.mark.parametrize("kind", KINDS)
+every = pytest.mark.parametrize("kind", NOISE_KINDS)
 
 
 def drawn(kind, seed=0, samples=SAMPLES):

@@ -16,13 +16,13 @@ from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
 from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control.laws._path_law import textbook_law as textbook_law
+from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc
+from sfkd_jax.control.planners._mppi import mppi as mppi
 from sfkd_jax.control.planners._planner import Planner as Planner
 from sfkd_jax.control.planners._planner import SearchResult as SearchResult
 from sfkd_jax.control.planners._planner import tuned as tuned
-from sfkd_jax.control.planners._sampling import cem as cem
-from sfkd_jax.control.planners._sampling import mppi as mppi
 from sfkd_jax.control.tasks._along_path import along_reference as along_reference
 from sfkd_jax.control.tasks._along_path import behind as behind
 from sfkd_jax.control.tasks._along_path import following_law as following_law

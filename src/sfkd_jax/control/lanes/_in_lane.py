@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from sfkd_jax.control._factory import Stateful, factory
+from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.lanes._manoeuvre import Judged, Manoeuvres, Situation
 from sfkd_jax.control.lanes._reference import (
     BEHIND,
@@ -19,7 +20,6 @@ from sfkd_jax.control.lanes._reference import (
     speed_profile,
     window,
 )
-from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.lanes import Lane, Obstacles, finite
 from sfkd_jax.paths import Lap, point_at, project
 from sfkd_jax.ranges import (

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.control._factory import factory
+from sfkd_jax.control._finite import replace_nonfinite
 from sfkd_jax.control.planners._planner import (
     Evaluate,
-    Plan,
     Planner,
     SearchResult,
     Tuning,
     iterate,
-    replace_nonfinite,
 )
+from sfkd_jax.control.planners._rollouts import Plan
 from sfkd_jax.ranges import AtLeastOne, AtLeastTwo, Fraction
 from sfkd_jax.types import Key, Scalar
 
@@ -29,15 +29,16 @@ class GradientPlanner(Planner):
 
     Perturbations are measured in units of noise_std (Σ = diag(σ²)), so a step of 1
     moves a control by about σ. All candidates of a line search are rolled out as one
-    batch, with s = 0 and ν = 0: the cost never increases, nor is above that of the law.
-    The perturbations that the limits allowed are kept: projected onto the limits.
+    batch. The plan itself (s = 0) and the law alone (ν = 0) are among them, so the cost
+    never increases, and is never above that of the law. The perturbations that the
+    limits allowed replace the plan, which projects it onto the limits.
 
     Nothing is random, and the key is not used. Derivatives that are not finite count
     as zero. The task must be differentiable.
 
     Attributes:
-        iterations: of gradient and line search per control step.
-        steps: candidates of a line search.
+        iterations: number of gradients, each with a line search, per control step.
+        steps: number of candidates of a line search.
         shrink: c in (0, 1).
     """
 
@@ -64,16 +65,22 @@ class GradientPlanner(Planner):
             slope = replace_nonfinite(jax.grad(cost_of)(plan), 0.0)
             downhill = -slope * std[None]  # in units of std
             size = jnp.sqrt(jnp.mean(downhill**2))
-            # Of unit size, so that a step length means the same for every cost.
+            # The direction has size 1, so a step length means the same for every cost.
             direction = downhill / jnp.where(size > 0, size, 1.0) * std[None]
             ahead = plan[:, None] + sizes[None, :, None] * direction[:, None]
-            # After a switch of e the plan of before may be worse than none.
-            tried = evaluate(jnp.append(ahead, jnp.zeros_like(ahead[:, :1]), axis=1))
-            costs, _ = tried.ranked()
+            # The law alone is a candidate too: after a switch of e it may be better
+            # than the plan of the step before.
+            law_alone = jnp.zeros_like(ahead[:, :1])
+            evaluated = evaluate(jnp.append(ahead, law_alone, axis=1))
+            costs, _ = evaluated.ranked()
             best = jnp.argmin(costs)
-            plan = replace_nonfinite(tried.perturbations[:, best], 0.0)
-            usable = jnp.isfinite(costs[best])
-            return plan, SearchResult(plan, usable, costs[best], jnp.ones(()))
+            plan = replace_nonfinite(evaluated.perturbations[:, best], 0.0)
+            return plan, SearchResult(
+                plan=plan,
+                usable=jnp.isfinite(costs[best]),
+                cost=costs[best],
+                effective_samples=jnp.ones(()),
+            )
 
         return iterate(descend, plan, key, self.iterations)
 

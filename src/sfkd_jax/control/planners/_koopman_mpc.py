@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control.laws._feedback import PathErrors, path_errors
 from sfkd_jax.control.planners._planner import (
     Evaluate,
-    Plan,
     Planner,
     SearchResult,
     Tuning,
 )
+from sfkd_jax.control.planners._rollouts import Plan
 from sfkd_jax.control.tasks._path_tracking import (
     Cost,
     PathTarget,

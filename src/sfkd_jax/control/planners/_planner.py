@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -10,45 +9,32 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, UInt32
 
 from sfkd_jax.control._factory import Stateful
-from sfkd_jax.control.tasks._task import (
-    PlanningStart,
-    RolloutSetup,
-    Sample,
-    StepIndex,
-    Task,
-)
+from sfkd_jax.control._finite import all_finite
+from sfkd_jax.control.planners._rollouts import Evaluated, Plan, Plans, Rollouts
+from sfkd_jax.control.tasks._task import PlanningStart, Task
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
-from sfkd_jax.rollout import in_batches
 from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
 
-Plan: TypeAlias = Float[Array, "horizon control"]
-Plans: TypeAlias = Float[Array, "horizon sample control"]
-TOGETHER = 2**25
-"""Entries of the states of all samples and steps up to which they are rolled out at
-once: 128 MiB, of which there are a few copies.
-"""
-SHORT = 24
-"""Entries of a sample's state up to which samples are the last axis of a step."""
-UNROLLED = 4
-"""Steps of longer states in one pass of a loop."""
-C = TypeVar("C")
-Memory = TypeVar("Memory")
+Evaluate: TypeAlias = Callable[[Plans], Evaluated]
+"""A function that rolls out plans, (horizon, sample, control)."""
+Carry = TypeVar("Carry")
+ControllerState = TypeVar("ControllerState")
 
 
 class Tuning(NamedTuple):
-    """Settings that are data of a running planner: changing them recompiles nothing.
+    """Settings that are data of a running planner, so a change compiles nothing again.
 
     Attributes:
         temperature: λ of MPPI, in units of cost.
-        effective_samples: target of 1 / Σ w² from which λ follows, for planners built
-            with one.
-        noise_std: per control channel, in control units.
-        elapsed: sampling periods since the last call. The plan is shifted by as many,
-            fractions included; NaN counts as one, and so does every later call that
-            does not set it again.
+        effective_samples: the value of 1 / Σ w² from which λ follows; only a planner
+            that was built with such a value reads it.
+        noise_std: standard deviation of the samples, in units of each control.
+        elapsed: number of sampling periods since the last call. The plan is shifted by
+            as many, fractions included. NaN counts as one period. Every call sets the
+            entry to one, so a later call counts as one period as well.
         cost: weights of the task's cost.
         constraints: data of the task's constraints, see `constrained`.
     """
@@ -66,43 +52,29 @@ class PlannerState(NamedTuple):
 
     plan: Plan  # rows ν_0 … ν_{T-1}, perturbations of the task's law if it has one
     controls: Plan  # the controls of the last healthy rollout of that plan
-    previous: Control  # the control applied last
+    previous: Control  # the control that was applied last
     started: Bool[Array, ""]  # whether a control was planned before
-    # Data of the random key of the next samples: the state is plain arrays.
+    # The data of the random key of the next samples, so that the state is plain arrays.
     key: UInt32[Array, " word"]
-    tuning: Tuning  # see `Tuning`
+    tuning: Tuning
 
 
-class Evaluated(NamedTuple):
-    """What the rollouts of plans came to."""
+class ChosenPlan(NamedTuple):
+    """The plan that is driven, with the results of its rollout.
 
-    costs: Float[Array, " sample"]  # of the whole rollouts
-    controls: Plans  # applied, within the limits
-    perturbations: Plans  # the parts of the plans that the limits allowed
-    states: Any  # predicted, (horizon, sample, …)
-    # The largest of a constraint over the horizon, not above 0 where all are kept; None
-    # without constraints.
-    violations: Float[Array, " sample"] | None
+    Attributes:
+        plan: rows of the task.
+        cost: of its rollout.
+        controls: that the rollout applied.
+        states: predicted ones, every leaf (horizon, …).
+        violation: the largest value of a constraint; None without constraints.
+    """
 
-    def ranked(self) -> tuple[Float[Array, " sample"], Bool[Array, ""]]:
-        """Return costs in lexicographic order, and whether a sample keeps constraints.
-
-        The rank of a sample that violates one, or is not finite, is infinite; if all
-        violate one, the ranks are the violations.
-        """
-        costs = replace_nonfinite(self.costs, jnp.inf)
-        if self.violations is None:
-            return costs, jnp.asarray(True)
-        # A rollout that is not finite keeps nothing, whatever its violation says.
-        violations = jnp.where(jnp.isfinite(costs), self.violations, jnp.inf)
-        kept = violations <= 0.0
-        any_kept = jnp.any(kept)
-        costs = jnp.where(kept, costs, jnp.inf)
-        return jnp.where(any_kept, costs, violations), any_kept
-
-
-Evaluate: TypeAlias = Callable[[Plans], Evaluated]
-"""Rolls out plans."""
+    plan: Plan
+    cost: Scalar
+    controls: Plan
+    states: Any
+    violation: Scalar | None
 
 
 class SearchResult(NamedTuple):
@@ -127,19 +99,20 @@ class SearchResult(NamedTuple):
 class Planner(Stateful):
     """The receding-horizon controller of a task; a subclass searches for its best plan.
 
-    Values that are not finite never enter the plan. If all rollouts are not finite, or
-    the observation, environment or reference is not, the controller continues the last
-    healthy plan and `info["healthy"]` is False. So it is where the reference cannot be
-    followed, see `RolloutSetup.followable`.
+    Values that are not finite never enter the plan. If no rollout is finite, or the
+    observation, environment or reference is not finite, the controller goes on with the
+    last healthy plan and `info["healthy"]` is False. `info["healthy"]` is also False
+    where the reference cannot be followed, see `RolloutSetup.followable`.
 
-    A planner of your own is a subclass with `search`, and `factory(Mine,
-    Mine.controller)` its factory; an entry in `build.PLANNERS` gives it settings.
+    To write another planner, define `search` in a subclass. `factory(Mine,
+    Mine.controller)` is then its factory, and an entry in `build.PLANNERS` gives it
+    settings.
 
     Attributes:
         task: the planning problem.
         horizon: T, number of steps.
-        noise_std: scale of a perturbation, one entry a control; initial value in
-            `Tuning`.
+        noise_std: scale of a perturbation, one entry for each control. It is the
+            initial value of the entry in `Tuning`.
         env_low: lower end of the environment box; an environment outside is clipped.
         env_high: upper end of the environment box.
     """
@@ -161,32 +134,32 @@ class Planner(Stateful):
     def search(
         self, key: Key, plan: Plan, tuning: Tuning, evaluate: Evaluate
     ) -> SearchResult:
-        """Return the best plan near another; what a subclass defines.
+        """Return the best plan near another one; a subclass defines this.
 
-        It sees plans and their costs alone, so it works for any task.
+        A search sees plans and their costs alone, so it works for any task.
 
         Args:
-            key: consumed.
-            plan: the shifted one, around which to search.
+            key: random key, which the search consumes.
+            plan: the shifted plan of the last step, around which to search.
             tuning: settings that are data.
             evaluate: rolls out plans of shape (horizon, sample, control).
         """
         raise NotImplementedError
 
     def init(self, key: Key) -> PlannerState:
-        """Return the state before the first step: a plan of zeros, the law alone.
+        """Return the state before the first step, whose plan of zeros is the law alone.
 
-        No two entries share a buffer, so that the state can be donated.
+        No two entries share a buffer, so the state can be donated.
         """
         shape = (self.horizon, len(self.noise_std))
-        real = partial(jnp.array, dtype=float)
+        as_real = partial(jnp.array, dtype=float)
         tuning = Tuning(
             temperature=jnp.ones(()),
             effective_samples=jnp.zeros(()),
-            noise_std=real(self.noise_std),
+            noise_std=as_real(self.noise_std),
             elapsed=jnp.ones(()),
-            cost=jax.tree.map(real, self.task.weights),
-            constraints=jax.tree.map(real, self.task.constraint_data),
+            cost=jax.tree.map(as_real, self.task.weights),
+            constraints=jax.tree.map(as_real, self.task.constraint_data),
         )
         return PlannerState(
             plan=jnp.zeros(shape),
@@ -211,44 +184,29 @@ class Planner(Stateful):
         precise = task.check(observation, env, reference, self.horizon)
         # What is not finite must be noticed even where neither model nor cost reads it.
         clean = all_finite((observation, env, reference))
-        inside = env
-        if self.env_low is not None and self.env_high is not None:
-            inside = jnp.clip(
-                env, jnp.asarray(self.env_low), jnp.asarray(self.env_high)
-            )
+        inside = self._nearest(env)
         search_key, next_key = jax.random.split(jax.random.wrap_key_data(state.key))
         # A clock that fails gives NaN; the call then counts as being in time.
         elapsed = jnp.where(jnp.isnan(tuning.elapsed), 1.0, tuning.elapsed)
-        # The stored plan begins one period after the last call; this one may be later.
+        # The stored plan begins one period after the last call; this call may be later.
         late = jnp.maximum(elapsed - 1.0, 0.0)
-        before, held = shift((state.plan, state.controls), late)
+        before, controls_before = shift((state.plan, state.controls), late)
 
         # Everything that all samples share is computed once, outside the rollouts.
         start = PlanningStart(state.previous, state.started)
         setup = task.prepare(params, observation, inside, reference, start)
-        evaluate = partial(self._roll_out, tuning, setup)
+        evaluate = Rollouts(task, setup, tuning.cost, tuning.constraints)
         result = self.search(search_key, before, tuning, evaluate)
+        chosen = self._choose(result, evaluate)
 
-        # The chosen plan is new (a mean): its cost is known from its rollout.
-        plans = result.plan[:, None]
-        chosen = 0
-        if task.constraint is not None and result.best is not None:
-            # The mean of plans that pass an obstacle on both sides hits it: the best
-            # single candidate replaces it where that violates less.
-            plans = jnp.stack([result.plan, result.best], axis=1)
-        costs, controls, _, states, violations = evaluate(plans)
-        if violations is not None:
-            chosen = jnp.argmin(violations)
-
-        # Otherwise the last healthy plan continues: it was shifted, its end is held.
-        healthy = clean & result.usable & jnp.isfinite(costs[chosen])
-        plan = jnp.where(healthy, plans[:, chosen], before)
-        controls = jnp.where(healthy, controls[:, chosen], held)
+        # Otherwise the last healthy plan goes on: it was shifted, and its end is held.
+        healthy = clean & result.usable & jnp.isfinite(chosen.cost)
+        plan = jnp.where(healthy, chosen.plan, before)
+        controls = jnp.where(healthy, chosen.controls, controls_before)
         # Zeros, the controls before the first plan, may lie outside the box.
         control = jnp.clip(controls[0], task.low, task.high)
-        # Further delay is made up for by the next call.
-        elapsed = jnp.minimum(elapsed, 1.0)
-        plan, controls = shift((plan, controls), elapsed)
+        # A delay of more than one period is made up for by the next call.
+        plan, controls = shift((plan, controls), jnp.minimum(elapsed, 1.0))
         after = PlannerState(
             plan=plan,
             controls=controls,
@@ -257,121 +215,81 @@ class Planner(Stateful):
             key=jax.random.key_data(next_key),
             tuning=tuning._replace(elapsed=jnp.ones_like(tuning.elapsed)),
         )
-        known = jnp.asarray(True) if inside is env else jnp.all(inside == env)
+        unclipped = jnp.asarray(True) if inside is env else jnp.all(inside == env)
         info: ControllerInfo = {
             "cost": result.cost,
-            "mean_cost": costs[chosen],
+            "mean_cost": chosen.cost,
             "effective_samples": result.effective_samples,
             "healthy": healthy & setup.followable,
-            "env_inside": known,
-            "predicted_states": jax.tree.map(lambda leaf: leaf[:, chosen], states),
+            "env_inside": unclipped,
+            "predicted_states": chosen.states,
         }
         if precise is not None:
             # A coarse plan is driven, not replaced: it is better than the last one.
             info["precision"] = precise
             info["healthy"] = info["healthy"] & precise
-        if violations is not None:
-            info["violation"] = violations[chosen]
-            info["constraints_kept"] = violations[chosen] <= 0.0
+        if chosen.violation is not None:
+            info["violation"] = chosen.violation
+            info["constraints_kept"] = chosen.violation <= 0.0
         return control, after, info
 
-    def _roll_out(self, tuning: Tuning, setup: RolloutSetup, plans: Plans) -> Evaluated:
-        """Roll out all plans, as many at a time as the memory holds."""
-        task = self.task
-        start = setup.start
-        targets = setup.targets
-        numbers = jnp.arange(self.horizon)
-        places = StepIndex(numbers, (numbers == self.horizon - 1).astype(plans.dtype))
+    def _nearest(self, env: Any) -> Any:
+        """Return the environment, clipped to its box if there is one."""
+        if self.env_low is None or self.env_high is None:
+            return env
+        return jnp.clip(env, jnp.asarray(self.env_low), jnp.asarray(self.env_high))
 
-        # Of vectors of a few entries a processor would use a fraction of its width, so
-        # that samples are the last axis, and costs are evaluated for all steps at once.
-        # Longer ones it multiplies faster as rows, and should not leave its cache.
-        entries = sum(leaf.size for leaf in jax.tree.leaves(start))
-        short = entries <= SHORT
-        # Axis of the samples in one step, and in arrays of all steps.
-        axis, along_steps = (-1, -1) if short else (0, 1)
+    def _choose(self, result: SearchResult, evaluate: Evaluate) -> ChosenPlan:
+        """Return the plan to drive; it is new (a mean), so it is rolled out once more.
 
-        def judge(before: Any, after: Any, target: Any, at: StepIndex) -> Any:
-            cost = after.cost
-            worst = None
-            seen = (after.state, after.control)
-            if task.cost is not None:
-                pair = before._replace(latent=()), Sample((), *seen)
-                cost = task.cost(tuning.cost, *pair, target, at)
-            if task.constraint is not None:
-                every = task.constraint(tuning.constraints, *seen, target, at)
-                # NaN compares as kept, so it must not get through.
-                worst = jnp.max(jnp.where(jnp.isnan(every), jnp.inf, every))
-            return Evaluated(
-                cost, after.control, after.perturbation, after.state, worst
-            )
-
-        def body(before: Any, inputs: Any) -> Any:
-            after = task.step(tuning.cost, setup.context, before, *inputs)
-            seen = after._replace(sample=None)
-            return after.sample, seen if short else judge(before, seen, *inputs[1:])
-
-        step = jax.vmap(body, in_axes=(axis, (axis, None, None)), out_axes=axis)
-        each = jax.vmap(judge, in_axes=(axis, axis, None, None), out_axes=axis)
-
-        def together(plans: Array) -> Any:
-            count = plans.shape[0]
-            first = jax.tree.map(
-                lambda leaf: jnp.repeat(jnp.expand_dims(leaf, axis), count, axis), start
-            )
-            inputs = jnp.moveaxis(plans, 0, along_steps), targets, places
-            _, seen = jax.lax.scan(step, first, inputs, unroll=1 if short else UNROLLED)
-            if short:
-                before = None
-                if task.cost is not None:
-                    before = jax.tree.map(
-                        lambda leaf, rest: jnp.concatenate([leaf[None], rest[:-1]]),
-                        first._replace(latent=()),
-                        Sample((), seen.state, seen.control),
-                    )
-                seen = jax.vmap(each)(before, seen, targets, places)
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, along_steps, 0), seen)
-
-        # Batches of one size.
-        most = max(TOGETHER // (entries * self.horizon), 1)
-        size = math.ceil(plans.shape[1] / math.ceil(plans.shape[1] / most))
-        along = jax.tree.map(
-            lambda leaf: jnp.swapaxes(leaf, 0, 1),
-            in_batches(together, jnp.swapaxes(plans, 0, 1), size=size),
-        )
-        worst = along.violations
-        ones = jnp.ones(self.horizon, along.costs.dtype)
-        # A product: a sum would be one loop with the costs that it is over. In full
-        # precision: accelerators round factors to ten bits.
-        exact = jax.lax.Precision.HIGHEST
-        return along._replace(
-            costs=jnp.matmul(ones, along.costs, precision=exact),
-            violations=None if worst is None else jnp.max(worst, axis=0),
+        The mean of plans that pass an obstacle on both sides hits it. With constraints,
+        the best single candidate replaces the mean where it violates less.
+        """
+        plans = result.plan[:, None]
+        if self.task.constraint is not None and result.best is not None:
+            plans = jnp.stack([result.plan, result.best], axis=1)
+        evaluated = evaluate(plans)
+        index = 0
+        violation = None
+        if evaluated.violations is not None:
+            index = jnp.argmin(evaluated.violations)
+            violation = evaluated.violations[index]
+        return ChosenPlan(
+            plan=plans[:, index],
+            cost=evaluated.costs[index],
+            controls=evaluated.controls[:, index],
+            states=jax.tree.map(lambda leaf: leaf[:, index], evaluated.states),
+            violation=violation,
         )
 
 
 def iterate(
-    improve: Callable[[C, Key], tuple[C, SearchResult]], start: C, key: Key, count: int
+    improve: Callable[[Carry, Key], tuple[Carry, SearchResult]],
+    start: Carry,
+    key: Key,
+    count: int,
 ) -> SearchResult:
-    """Return the result of the last of several improvements of a plan."""
-    # Splitting the key would change the plans of a single iteration.
+    """Return the result of the last of `count` improvements of a plan."""
+    # A single iteration uses the key as it is; a split would change its samples.
     if count == 1:
         return improve(start, key)[1]
     _, results = jax.lax.scan(improve, start, jax.random.split(key, count))
     return jax.tree.map(lambda leaf: leaf[-1], results)
 
 
-def tuned(state: Memory, **changes: Any) -> Memory:
-    """Return the state with other entries of `Tuning`, of the types that it has.
+def tuned(state: ControllerState, **changes: Any) -> ControllerState:
+    """Return the state of a controller with other values of entries of `Tuning`.
 
-    A plain number would be of a weaker type, and compile the planner again.
+    The values are converted to the types that the entries have. A plain number has a
+    weaker type, with which the planner would be compiled again.
 
     Args:
-        state: of a controller, in which a planner's is found however deep it lies.
-        changes: entries of `Tuning`; of `cost`, any part of a dict.
+        state: of a controller; the state of a planner may lie at any depth in it.
+        changes: entries of `Tuning`. If `cost` is a dictionary, a part of it suffices.
 
     Raises:
-        ValueError: no planner, an unknown entry, or another shape.
+        ValueError: the state holds no planner, an entry is unknown, or a value has
+            another shape.
     """
 
     def is_planner(node: Any) -> bool:
@@ -379,11 +297,12 @@ def tuned(state: Memory, **changes: Any) -> Memory:
 
     if not any(map(is_planner, jax.tree.leaves(state, is_leaf=is_planner))):
         raise ValueError(f"{type(state).__name__} holds no state of a planner to tune")
-    if unknown := sorted(set(changes) - set(Tuning._fields)):
+    unknown = sorted(set(changes) - set(Tuning._fields))
+    if unknown:
         known = ", ".join(Tuning._fields)
         raise ValueError(f"unknown entry of tuning {unknown[0]}; there are {known}")
 
-    def of_type(before: Array, value: Any) -> Array:
+    def as_before(before: Array, value: Any) -> Array:
         after = jnp.asarray(value, dtype=before.dtype)
         if after.shape != before.shape:
             raise ValueError(f"tuning has shape {before.shape}, got {after.shape}")
@@ -393,38 +312,33 @@ def tuned(state: Memory, **changes: Any) -> Memory:
         if not is_planner(node):
             return node
         before = node.tuning
-        wanted = dict(changes)
+        values = dict(changes)
         if isinstance(before.cost, dict):
             # Weights that are not named keep their values.
-            wanted["cost"] = before.cost | changes.get("cost", {})
-        after = jax.tree.map(of_type, before, before._replace(**wanted))
+            values["cost"] = {**before.cost, **changes.get("cost", {})}
+        after = jax.tree.map(as_before, before, before._replace(**values))
         return node._replace(tuning=after)
 
     return jax.tree.map(change, state, is_leaf=is_planner)
 
 
 def shift(plans: Any, elapsed: Scalar) -> Any:
-    """Shift plans by `elapsed` periods: linear in between, the last step held."""
+    """Shift plans in time by `elapsed` periods.
+
+    Between two steps a plan is interpolated linearly; after its last step it is held.
+
+    Args:
+        plans: arrays with the horizon as their leading axis.
+        elapsed: number of sampling periods, not below 0.
+    """
     steps = jnp.arange(len(jax.tree.leaves(plans)[0]), dtype=elapsed.dtype)
     times = jnp.clip(steps + elapsed, 0, len(steps) - 1)
     whole = jnp.floor(times)
     index = whole.astype(int)
     share = (times - whole)[:, None]
     after = jnp.minimum(index + 1, len(steps) - 1)
-    return jax.tree.map(lambda p: p[index] + share * (p[after] - p[index]), plans)
 
+    def interpolated(plan: Plan) -> Plan:
+        return plan[index] + share * (plan[after] - plan[index])
 
-def replace_nonfinite(
-    values: Float[Array, "*shape"], fill: float
-) -> Float[Array, "*shape"]:
-    """Replace NaN and infinity by `fill`."""
-    return jnp.where(jnp.isfinite(values), values, fill)
-
-
-def all_finite(tree: Any) -> Bool[Array, ""]:
-    """Whether every real or complex entry of every leaf is finite."""
-    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    real = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.all(
-        jnp.stack([jnp.asarray(True), *(jnp.all(jnp.isfinite(leaf)) for leaf in real)])
-    )
+    return jax.tree.map(interpolated, plans)

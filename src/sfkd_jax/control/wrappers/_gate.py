@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import Stateful
+from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview, check_preview
 from sfkd_jax.control.wrappers._estimator import Applied, input_error
 from sfkd_jax.control.wrappers._innovations import (

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import Stateful
+from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.laws._feedback import holding
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.control.planners._planner import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._gate import ANYWHERE, Box, Conditions
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
