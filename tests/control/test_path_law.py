@@ -10,7 +10,7 @@ import pytest
 from composing import settings
 from helpers import jit
 
-from sfkd_jax import demo, plants, policy
+from sfkd_jax import plants, policy
 from sfkd_jax.control import TEXTBOOK, derive_path_law, textbook_law
 from sfkd_jax.experiment import data, identified
 from sfkd_jax.geometry import path_state, path_step
@@ -125,7 +125,7 @@ def test_the_law_is_linear_near_the_path_and_continuous_beyond(derived):
 @pytest.mark.parametrize("name", PLANTS)
 def test_from_far_away_the_shipped_law_comes_back(name):
     """Up to 20 m away, heading anywhere, on ice and in wind: within 20 s, on a curve."""
-    policy_of = policy.restore(demo.SHIPPED / f"{name}_path")
+    policy_of = policy.restore(policy.SHIPPED / f"{name}_path")
     plant, law = policy_of.vehicle, policy_of.law
     loop = plants.along_path(plant, law)
     random, count = np.random.default_rng(1), 60
@@ -145,7 +145,7 @@ def test_from_far_away_the_shipped_law_comes_back(name):
 
 
 def test_the_law_brakes_to_a_standstill_and_stays_there():
-    policy_of = policy.restore(demo.SHIPPED / "dynamic_path")
+    policy_of = policy.restore(policy.SHIPPED / "dynamic_path")
     loop = plants.along_path(policy_of.vehicle, policy_of.law)
     inputs, env = jnp.zeros(4), jnp.asarray([0.5, 4.0])
     start = path_state(jnp.zeros(6).at[0].set(0.1).at[2].set(8.0))
@@ -182,7 +182,7 @@ def test_a_law_of_a_model_fitted_to_runs_without_a_law_holds_the_car(
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_law_derived_again_is_that_of_the_shipped_policy(name):
     """Friction and wind at their ends and centres; the stored tables are finer."""
-    stored = policy.restore(demo.SHIPPED / f"{name}_path")
+    stored = policy.restore(policy.SHIPPED / f"{name}_path")
     whose = stored.settings["dataset"]["law"].get("model", "plant")
     options = (f"vehicle={name}", "dataset.law.points=[13,13,3]")
     chosen = settings("+experiment=s3", *options, f"dataset.law.model={whose}")

@@ -10,7 +10,7 @@ import pytest
 from helpers import any_law, jit, tiny
 
 import sfkd_jax
-from sfkd_jax import build, control, demo, scenarios
+from sfkd_jax import build, control, scenarios
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.plants import kinematic
@@ -655,7 +655,7 @@ class _Timed(NamedTuple):
 @pytest.mark.parametrize("car", ["dynamic", "kinematic"])
 def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(car):
     """From 10 m/s at 2.5 m/s², in S3's schedule, with sensor noise and a hard planner."""
-    policy = sfkd_jax.load(demo.SHIPPED / f"{car}_path")
+    policy = sfkd_jax.load(f"{car}_path")
     plant, law, count = policy.vehicle, policy.law, len(policy.vehicle.state_names)
 
     def follows(params, memory, xi, env, preview):
