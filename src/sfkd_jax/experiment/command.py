@@ -31,13 +31,16 @@ from sfkd_jax.experiment.runs import IDENTITY
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, print_message
 
-FAILED, INTERRUPTED = 1, 130
+FAILED = 1
+"""Exit code of a command that ends with an expected error."""
+INTERRUPTED = 130
+"""Exit code of a command that the user interrupts."""
 OUTCOMES = {CertificationRefused: ("refused: ", 2), CertificateStale: ("stale: ", 3)}
-"""What stands before the line, and the exit code; others are `FAILED`."""
+"""Errors with an exit code of their own: what begins their line, and the code."""
 EXPECTED = (*OUTCOMES, ArtefactError, ValueError, training.TrainingStopped, OSError)
 """Errors that become one line."""
 LONGEST_NAME = 160
-"""Characters of a directory name of a sweep; file systems allow 255."""
+"""The most characters of a directory name of a sweep; file systems allow 255."""
 
 
 def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], None]:
@@ -54,7 +57,8 @@ def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], Non
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         try:
             settings = named_for_controller(settings_of(composed))
-            settings = named_for_sweep(settings) if sweeping else settings
+            if sweeping:
+                settings = named_for_sweep(settings)
             use_compilation_cache(Path(settings.root))
             if not settings.optimized:
                 compile_fast()
@@ -94,7 +98,11 @@ def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], Non
 
 
 def _unusable(words: list[str]) -> str | None:
-    """Why Hydra would end in a traceback, or in a word of its grammar."""
+    """Return why a command line cannot be used, where Hydra would not say it plainly.
+
+    Hydra would end in a traceback, or in a message about its grammar. None: Hydra may
+    have the words.
+    """
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -118,7 +126,8 @@ def _unusable(words: list[str]) -> str | None:
 def conf_path() -> str:
     """Return the folder of options: of the checkout, or of the installed package."""
     package = Path(__file__).resolve().parents[1]
-    installed, checkout = package / "conf", package.parents[1] / "conf"
+    installed = package / "conf"
+    checkout = package.parents[1] / "conf"
     return str(installed if installed.exists() else checkout)
 
 
@@ -129,9 +138,11 @@ def settings_of(composed: DictConfig) -> Settings:
 
 
 def _typed() -> list[str]:
-    """The overrides of the running command, as they were typed."""
+    """Return the overrides of the running command, as they were typed."""
     # A program that calls a command as a function has typed nothing.
-    return [*HydraConfig.get().overrides.task] if HydraConfig.initialized() else []
+    if not HydraConfig.initialized():
+        return []
+    return [*HydraConfig.get().overrides.task]
 
 
 def compose(*overrides: str) -> Settings:
@@ -177,12 +188,13 @@ def named_for_sweep(settings: Settings) -> Settings:
     It says what changes the weights, so that jobs do not write into one directory.
     """
     # By setting, such as "training.steps": model and seed choose directories already.
-    changed = {word.lstrip("+"): word.lstrip("+").split("=")[0] for word in _typed()}
-    overrides = [
-        word
-        for word, setting in changed.items()
-        if setting.split(".")[0] in IDENTITY and setting not in ("model", "seed")
-    ]
+    overrides = []
+    # An override that was typed twice changes no more than once.
+    for override in dict.fromkeys(word.lstrip("+") for word in _typed()):
+        setting = override.split("=")[0]
+        group = setting.split(".")[0]
+        if group in IDENTITY and setting not in ("model", "seed"):
+            overrides.append(override)
     if not overrides:
         return settings
     name = _name_of(overrides)
@@ -198,15 +210,15 @@ def named_for_controller(settings: Settings) -> Settings:
 
     Rows of results.json are told apart by names: with other samples it is another row.
     """
-    typed = [word.lstrip("+").partition("controller.") for word in _typed()]
-    changed = [
-        word
-        for before, group, word in typed
-        if group and not before and not word.startswith("name=")
-    ]
-    if not changed:
+    prefix = "controller."
+    overrides = []
+    for word in _typed():
+        override = word.lstrip("+")
+        if override.startswith(prefix) and not override.startswith(f"{prefix}name="):
+            overrides.append(override.removeprefix(prefix))
+    if not overrides:
         return settings
-    name = f"{settings.controller.name},{_name_of(changed)}"
+    name = f"{settings.controller.name},{_name_of(overrides)}"
     return replace(settings, controller=replace(settings.controller, name=name))
 
 

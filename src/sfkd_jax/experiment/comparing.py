@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
@@ -22,13 +22,21 @@ from sfkd_jax.settings import replace
 from sfkd_jax.training import TrainingStopped
 
 OF_A_ROW = (TrainingStopped, ValueError, store.ArtefactError, JaxRuntimeError)
-"""Errors that end a row and not the table; JAX's is of memory that does not suffice."""
+"""Errors that end a row, not the table; JAX raises one where memory does not suffice."""
 NUM_STORED_EPISODES = 2
 """Episodes of a cell whose arrays are stored for figures; its row covers them all."""
 
 
 class Cell(NamedTuple):
-    """One row of the comparison on one scenario; all are words of the settings."""
+    """One row of the comparison on one scenario.
+
+    Attributes:
+        vehicle: option of the group `vehicle`.
+        label: of the row.
+        seed: of the training.
+        controller: option of the group `controller`.
+        scenario: option of the group `scenario`.
+    """
 
     vehicle: str
     label: str
@@ -38,8 +46,8 @@ class Cell(NamedTuple):
 
     def path(self, directory: Path) -> Path:
         """Return the path of the cell's files in a comparison, without suffixes."""
-        folders = self.vehicle, self.scenario, self.controller
-        return directory.joinpath("cells", *folders, f"{self.label}-seed={self.seed}")
+        folder = directory / "cells" / self.vehicle / self.scenario / self.controller
+        return folder / f"{self.label}-seed={self.seed}"
 
 
 def list_cells(comparison: ComparisonSettings) -> list[Cell]:
@@ -47,7 +55,8 @@ def list_cells(comparison: ComparisonSettings) -> list[Cell]:
 
     Seed by seed, so that a table that was interrupted still compares all rows.
     """
-    rows, seeds = comparison.rows, comparison.seeds
+    rows = comparison.rows
+    seeds = comparison.seeds
     for name in ("only", "one_seed"):
         if unknown := set(getattr(comparison, name)) - set(rows):
             raise ValueError(
@@ -61,19 +70,25 @@ def list_cells(comparison: ComparisonSettings) -> list[Cell]:
     for seed, vehicle, label in itertools.product(seeds, comparison.vehicles, labels):
         if label in comparison.one_seed and seed != seeds[0]:
             continue
+        replacements = comparison.own_controllers.get(label, {})
         for common, scenarios in comparison.controllers.items():
-            own = comparison.own_controllers.get(label, {}).get(common, common)
-            # A row may have no controller of its own for a common one.
-            chosen = scenarios if own else ()
-            cells += [Cell(vehicle, label, seed, str(own), name) for name in chosen]
+            controller = replacements.get(common, common)
+            # A row may have no controller in place of a common one.
+            if not controller:
+                continue
+            for scenario in scenarios:
+                cells.append(Cell(vehicle, label, seed, controller, scenario))
     return cells
 
 
 def group_cells(cells: list[Cell]) -> list[list[Cell]]:
     """Group cells that differ only in the scenario: one program evaluates them."""
-    return [
-        list(group) for _, group in itertools.groupby(cells, key=lambda cell: cell[:4])
-    ]
+    return [list(group) for _, group in itertools.groupby(cells, key=_without_scenario)]
+
+
+def _without_scenario(cell: Cell) -> tuple[Any, ...]:
+    """Return all of a cell but its scenario."""
+    return cell[:4]
 
 
 def take_share(
@@ -109,9 +124,9 @@ def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
 
 def settings_hash(settings: Settings) -> str:
     """Hash the settings that the result of a cell depends on, not the code."""
-    names = ("environment", "controller", "scenario", "certification", "evaluation")
-    chosen = {name: getattr(settings, name) for name in names}
-    return store.sha256(runs.identity(settings) | chosen)
+    groups = ("environment", "controller", "scenario", "certification", "evaluation")
+    further = {group: getattr(settings, group) for group in groups}
+    return store.sha256({**runs.identity(settings), **further})
 
 
 def episodes_hash(settings: Settings) -> str:
@@ -120,12 +135,19 @@ def episodes_hash(settings: Settings) -> str:
     Rows with another hash met other episodes, and are not paired with it.
     """
     protocol = settings.evaluation
-    counts = protocol.seed, protocol.episodes, protocol.episode_s
-    return store.sha256([*counts, settings.vehicle, settings.scenario])
+    return store.sha256(
+        [
+            protocol.seed,
+            protocol.episodes,
+            protocol.episode_s,
+            settings.vehicle,
+            settings.scenario,
+        ]
+    )
 
 
 def is_done(path: Path, settings: Settings) -> bool:
-    """Whether an undamaged cell with exactly these settings is stored."""
+    """Return whether an undamaged cell with exactly these settings is stored."""
     try:
         document = store.read_json(_row_file(path), keys=("row",))
         return document["made_with"] == settings_hash(settings)
@@ -139,7 +161,11 @@ def write_cell(
 ) -> Row:
     """Write the arrays of the first episodes, then the row, and return the row.
 
-    `path` is that of the cell without suffix, `directory` that of the comparison.
+    Args:
+        path: of the cell, without a suffix.
+        directory: of the comparison.
+        settings: of the cell.
+        result: of the system that the cell evaluates.
     """
     stored = {
         name: array[:NUM_STORED_EPISODES] if array.ndim else array
@@ -159,7 +185,8 @@ def collect_rows(
 ) -> list[Row]:
     """Return the rows of all stored cells, with seeds pooled and systems compared."""
     pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
-    others, by_other_code = [], []
+    with_other_settings = []
+    by_other_code = []
     for cell in cells:
         path = _row_file(cell.path(directory))
         if not path.exists():
@@ -167,19 +194,15 @@ def collect_rows(
         document = store.read_json(path, keys=("row", "made_with"))
         settings = compose_cell(cell)
         if document["made_with"] != settings_hash(settings):
-            others.append(path)
+            with_other_settings.append(path)
             continue
-        row = document["row"] | {"drives": episodes_hash(settings)}
+        row = {**document["row"], "drives": episodes_hash(settings)}
         # Seeds of a row are pooled under one key.
         pooled[cell._replace(seed=0)].append(row)
         if row.get("provenance") != runs.provenance():
             by_other_code.append(path)
-    notes = {"other settings: left out": others, "other code: used": by_other_code}
-    for note, paths in notes.items():
-        if paths:
-            store.print_message(
-                f"{len(paths)} cells were made by {note}, such as {paths[0]}"
-            )
+    _print_count(with_other_settings, "other settings: left out")
+    _print_count(by_other_code, "other code: used")
     rows = []
     for cell, trainings in pooled.items():
         if trainings:
@@ -188,7 +211,16 @@ def collect_rows(
     return evaluation.compare(rows, missing=len(pooled) - len(rows))
 
 
+def _print_count(paths: list[Path], reason: str) -> None:
+    """Print how many cells were made by something else, if there are any."""
+    if paths:
+        store.print_message(
+            f"{len(paths)} cells were made by {reason}, such as {paths[0]}"
+        )
+
+
 def _row_file(path: Path) -> Path:
+    """Return the path of the row of a cell, whose path has no suffix."""
     return path.with_name(f"{path.name}.row.json")
 
 
@@ -202,22 +234,22 @@ class Comparison:
         self.failed: dict[str, str] = {}
         self._settings = settings
         # Composed once: every cell is asked for its settings several times.
-        self._compose = functools.cache(self._composed)
+        self._compose = functools.cache(self._settings_of)
         self._episodes: dict[str, EpisodeSet] = {}
 
     def evaluate(self) -> int:
         """Evaluate all cells that are not done, and return how many there were."""
-        done = 0
         groups = take_share(group_cells(self.cells), self._settings.comparison.share)
         # Every row is built before the first one is trained.
         for group in groups:
-            with self._named_if_it_fails(group):
+            with self._recorded_if_it_fails(group):
                 self._check(group)
-        groups = [group for group in groups if _name(group) not in self.failed]
-        for group in groups:
-            with self._named_if_it_fails(group):
-                done += self._evaluate(group)
-        return done
+        sound = [group for group in groups if _name(group) not in self.failed]
+        evaluated = 0
+        for group in sound:
+            with self._recorded_if_it_fails(group):
+                evaluated += self._evaluate(group)
+        return evaluated
 
     def rows(self) -> list[Row]:
         """Return the rows of all stored cells; a ValueError if there is none."""
@@ -228,8 +260,8 @@ class Comparison:
             raise ValueError(f"nothing to compare: no row came out ({reasons})")
         return rows
 
-    def _composed(self, cell: Cell) -> Settings:
-        """The settings of a cell, under the name of the comparison."""
+    def _settings_of(self, cell: Cell) -> Settings:
+        """Return the settings of a cell, under the name of the comparison."""
         try:
             composed = command.compose(*overrides(cell, self._settings.comparison))
         except (HydraException, OmegaConfBaseException) as reason:
@@ -238,7 +270,7 @@ class Comparison:
         return replace(composed, name=self._settings.name)
 
     @contextmanager
-    def _named_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
+    def _recorded_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
         """Print and store why a row failed, and go on with the others."""
         try:
             yield
@@ -264,28 +296,34 @@ class Comparison:
                 stages.check_settings(self._of_policy(cell, settings))
 
     def _evaluate(self, group: list[Cell]) -> int:
-        """Evaluate the cells of one row under one controller that are not done."""
-        evaluate, done = None, 0
+        """Evaluate the cells of one row under one controller that are not done.
+
+        Returns how many there were.
+        """
+        evaluate = None
+        evaluated = 0
         for cell, settings, path in self._pending(group):
             episodes = self._make_episodes(settings)
             # Compiled once for all scenarios.
-            evaluate = evaluate or self._compiled(cell, settings)
+            if evaluate is None:
+                evaluate = self._compiled(cell, settings)
             result = evaluate(episodes)
             write_cell(path, self.directory, settings, result)
             error = 1e3 * result.row["rmse_m"]["mean"]
             store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
-            done += 1
-        return done
+            evaluated += 1
+        return evaluated
 
     def _pending(self, group: list[Cell]) -> Iterator[tuple[Cell, Settings, Path]]:
-        """The cells that are not done, their settings and their paths."""
+        """Yield the cells that are not done, with their settings and their paths."""
         for cell in group:
-            settings, path = self._compose(cell), cell.path(self.directory)
+            settings = self._compose(cell)
+            path = cell.path(self.directory)
             if not is_done(path, settings):
                 yield cell, settings, path
 
     def _of_policy(self, cell: Cell, settings: Settings) -> Settings:
-        """The settings of a cell under the name of the run that trains its policy."""
+        """Return the settings of a cell, named after the run that trains its policy."""
         policies = self._settings.comparison.policies
         return replace(settings, name=f"{policies}/{cell.vehicle}/{cell.label}")
 
@@ -298,15 +336,21 @@ class Comparison:
         return evaluating.SystemEvaluation(settings, name, system)
 
     def _make_episodes(self, settings: Settings) -> EpisodeSet:
-        """The episodes of a cell; rows that are compared share them."""
+        """Return the episodes of a cell; rows that are compared share them."""
         # Not the controller: rows are paired because they meet the same episodes.
-        parts = (settings.vehicle, settings.scenario, settings.environment)
-        key = store.sha256([*parts, settings.evaluation])
+        key = store.sha256(
+            [
+                settings.vehicle,
+                settings.scenario,
+                settings.environment,
+                settings.evaluation,
+            ]
+        )
         if key not in self._episodes:
             self._episodes[key] = evaluating.make_episodes(settings)
         return self._episodes[key]
 
 
 def _name(group: list[Cell]) -> str:
-    """The name of a row under one controller."""
-    return "/".join(map(str, group[0][:4]))
+    """Return the name of a row under one controller."""
+    return "/".join(map(str, _without_scenario(group[0])))
