@@ -106,7 +106,8 @@ def jump(path):
             path=runs.road[0],
         )
         cars.append(episodes)
-    film.write(path, film.Film(cars, steps - 1, car.corridor))
+    # To scale: without the gate the car leaves the road.
+    film.write(path, film.Film(cars, steps - 1, car.corridor, factor=1))
 
 
 def main():

@@ -25,8 +25,16 @@ SECONDS, EVERY = 13.5, 2
 """Of the episode that are shown; steps that a frame lasts."""
 LANE = LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
 """Deviation at which a car leaves its lane [m]."""
-_HALF, _SPACING = 3.4, 7.6
-"""Half width of a copy of the road as drawn, and distance of two copies [m]."""
+_HALF = 3.4
+"""Half width of the road as drawn [m]."""
+_SPACING = 7.6
+"""Width of what a copy of the road shows [m]."""
+_COPY = 0.123 * _SPACING
+"""Height of a copy on the page [in]."""
+_GAP = 0.1
+"""Between two copies [in]."""
+_TIMES = {2: "twice", 3: "three times"}
+"""How often the road is drawn, in words."""
 _BEHIND, _AHEAD = 14.0, 28.0
 """Of the view around the first car [m]."""
 _MOST, _TRAIL, _COLOURS = 10, 20, 48
@@ -93,9 +101,20 @@ class Film:
     """Episodes on one road, with states and a path; the first car is followed."""
 
     def __init__(
-        self, cars: list[Episodes], last: int, corridor: float | None = None
+        self,
+        cars: list[Episodes],
+        last: int,
+        corridor: float | None = None,
+        factor: int | None = None,
     ) -> None:
-        """Measure what is drawn of the first steps, beside a certified half width."""
+        """Measure what is drawn.
+
+        Args:
+            cars: with states and a path.
+            last: number of steps that are drawn.
+            corridor: certified half width [m].
+            factor: by which deviations are widened; by default as much as fits.
+        """
         self.cars, self.last, self.corridor = cars, last, corridor
         self.dt = cars[0].dt
         # Signed, left positive [m].
@@ -105,28 +124,35 @@ class Film:
         shown = [corridor or 0.0, *(one for one in peaks if one <= LANE)]
         self.largest = max(shown) or LANE
         # The same widening for all cars, so that they compare.
-        self.factor = int(np.clip(_HALF / self.largest, 1, _MOST))
+        self.factor = factor or int(np.clip(_HALF / self.largest, 1, _MOST))
         self.path = np.asarray(cars[0].path)
         self.near = [_nearest(np.asarray(one.states)[:, :2], self.path) for one in cars]
 
     def frames(self) -> Iterator[Image.Image]:
-        """The frames."""
-        tall = 0.123 * _SPACING * len(self.cars)
-        height = tall + 2.1
+        """The frames: a copy of the road for each car, and all deviations below."""
+        count = len(self.cars)
+        height = count * (_COPY + _GAP) + 2.14
         figure = style.canvas(height)
         # No layout engine: axes that shift between frames would make the film shake.
         figure.set_layout_engine("none")
         figure.set(figwidth=6.0, dpi=90)
-        road = figure.add_axes((0.125, 1 - (tall + 0.29) / height, 0.86, tall / height))
+        copies = []
+        for number in range(count):
+            bottom = height - 0.29 - _COPY - number * (_COPY + _GAP)
+            place = (0.125, bottom / height, 0.86, _COPY / height)
+            copies.append(figure.add_axes(place))
         errors = figure.add_axes((0.125, 0.49 / height, 0.86, 1.16 / height))
         # What no frame changes: scales, corridor, dashes at switches.
-        bottom = -_SPACING * (len(self.cars) - 0.5)
-        road.set(xlim=(-_BEHIND, _AHEAD), ylim=(bottom, 0.5 * _SPACING), aspect="equal")
-        road.set_axis_off()
-        words = style.scenario_label(str(self.cars[0].row.get("scenario")))
-        words = f"{style.literal(words)}, deviations × {self.factor}"
-        road.set_title(words, fontsize=9.5, loc="right", pad=4)
-        dt, high = self.dt, 1.5 * self.largest
+        edge = 0.5 * _SPACING
+        for axes in copies:
+            axes.set(xlim=(-_BEHIND, _AHEAD), ylim=(-edge, edge), aspect="equal")
+            axes.set_axis_off()
+        words = f"deviations × {self.factor}" if self.factor > 1 else "to scale"
+        if count > 1:
+            words = f"one road, drawn {_TIMES.get(count, f'{count} times')}, {words}"
+        copies[0].set_title(words, fontsize=9.5, loc="right", pad=4)
+        dt = self.dt
+        high = 1.5 * self.largest
         if self.corridor:
             style.draw_corridor(errors, self.corridor)
         for switch in self.cars[0].switches:
@@ -135,10 +161,12 @@ class Film:
         errors.set(xlim=(0.0, self.last * dt), ylim=(-high, high))
         errors.set_xlabel("time [s]", labelpad=1)
         errors.set_ylabel("deviation [m]")
+        scenario = style.scenario_label(str(self.cars[0].row.get("scenario")))
+        errors.set_title(style.literal(scenario), fontsize=9.5, loc="left", pad=4)
         errors.spines[["top", "right"]].set_visible(False)
 
         def draw(step: int) -> None:
-            self._draw_road(road, step)
+            self._draw_roads(copies, step)
             self._draw_errors(errors, step)
 
         return _each(figure, range(0, self.last, EVERY), draw)
@@ -152,31 +180,31 @@ class Film:
         now = Line2D([time[-1]] * 2, axes.get_ylim(), color=style.SOFT, linewidth=0.8)
         _put(axes, now)
 
-    def _draw_road(self, axes: Any, step: int) -> None:
+    def _draw_roads(self, copies: list[Any], step: int) -> None:
         """Every car on its copy of the road, seen from the first car after a step."""
-        envs, whole = self.cars[0].envs, {"transform": axes.transAxes}
+        envs = self.cars[0].envs
         friction, wind = (0.9, 0.0) if envs is None else envs[min(step, len(envs) - 1)]
-        _put(axes, Rectangle((0, 0), 1, 1, fc=_surface(friction), **whole))
-        for number in range(len(self.cars)):
+        for number, axes in enumerate(copies):
+            whole = {"transform": axes.transAxes}
+            _put(axes, Rectangle((0, 0), 1, 1, fc=_surface(friction), **whole))
             self._draw_car(axes, step + 1, number)
-        _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
+            _put(axes, Rectangle((0, 0), 1, 1, fill=False, clip_on=False, **whole))
+            _draw_wind(axes, wind, 0.93 * _AHEAD)
         if envs is not None:
+            whole = {"transform": copies[0].transAxes, "clip_on": False}
             words = f"friction {friction:.2g}, wind {round(wind):+d} m/s"
-            _put(axes, Text(0, 1.02, words, fontsize=9.5, clip_on=False, **whole))
-        _draw_wind(axes, wind, 0.93 * _AHEAD)
+            _put(copies[0], Text(0, 1.04, words, fontsize=9.5, **whole))
 
     def _draw_car(self, axes: Any, now: int, number: int) -> None:
         """One car on its copy of the road, its trail and its name."""
-        car, lateral = self.cars[number], self.deviations[number]
-        own, first = self.near[number], int(self.near[0][now])
-        path, centre = self.path, self.path[first]
-        color, shift = style.line(car.system)["color"], -_SPACING * number
+        car = self.cars[number]
+        lateral = self.deviations[number]
+        nearest = self.near[number]
+        first = int(self.near[0][now])
+        color = style.line(car.system)["color"]
+        seen = partial(_seen, self.path[first])
 
-        def seen(points: Any, offset: Any) -> np.ndarray:
-            """Positions to the left of path points on this copy, (2, point)."""
-            return _seen(centre, points, offset) + np.array([[0.0], [shift]])
-
-        around = path[max(first - 120, 0) : first + 160]
+        around = self.path[max(first - 120, 0) : first + 160]
         for side, dashes in ((-_HALF, "-"), (0.0, (0, (6, 5))), (_HALF, "-")):
             look: dict[str, Any] = {"color": "#aab1ba", "lw": 1.2, "ls": dashes}
             _put(axes, Line2D(*seen(around, side), **look))
@@ -186,18 +214,18 @@ class Film:
             _put(axes, _between(*edges, **style.BAND))
             for edge in edges:
                 _put(axes, Line2D(*edge, **style.EDGE))
-        # A car off its lane stays at the edge of its copy: beyond is another one's.
+        # A car off its lane stays at the edge of its copy.
         offset = self.factor * np.nan_to_num(np.append(0.0, lateral[:now]))
         offset = np.clip(offset, -0.5 * _SPACING, 0.5 * _SPACING)
         recent = slice(max(now - _TRAIL, 0), now + 1)
-        trail = seen(path[own[recent]], offset[recent])
+        trail = seen(self.path[nearest[recent]], offset[recent])
         _put(axes, Line2D(*trail, color=color, linewidth=1.8))
         yaw = np.asarray(car.states)[now, 2]
-        body = _turn_by(centre[2] - yaw) @ _CAR + trail[:, -1:]
+        body = _turn_by(self.path[first, 2] - yaw) @ _CAR + trail[:, -1:]
         _put(axes, Polygon(body.T, fc=color, ec=style.DARK))
         look = {"color": color, "fontweight": "bold", "fontsize": 9.5, "va": "center"}
         look["bbox"] = {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 1.5}
-        _put(axes, Text(4.5, shift - 2.3, style.literal(car.name), **look))
+        _put(axes, Text(4.5, -2.3, style.literal(car.name), **look))
 
 
 class LaneFilm:
@@ -219,6 +247,8 @@ class LaneFilm:
         self.states, self.car = np.asarray(episode.states), np.asarray(car)
         self.along, self.signals = np.append(0.0, episode.progress), episode.signals
         self.corridor = np.nan_to_num(episode.signals["corridor"])
+        # From where the road fills the view: it begins where the car starts.
+        self.first = int(np.argmax(self.along >= -_SIGHT[0]))
         self.last = min(round(SECONDS / dt), len(self.corridor))
 
     def frames(self) -> Iterator[Image.Image]:
@@ -241,7 +271,8 @@ class LaneFilm:
         ]
         about: dict[str, Any] = {"loc": "lower center", "ncols": 4, "frameon": False}
         figure.legend(handles=handles, fontsize=9, **about, columnspacing=1.4)
-        return _each(figure, range(0, self.last, EVERY), partial(self._draw, axes))
+        steps = range(self.first, self.last, EVERY)
+        return _each(figure, steps, partial(self._draw, axes))
 
     def _draw(self, axes: Any, step: int) -> None:
         """Road, obstacles, corridor and car at a step."""
@@ -284,7 +315,7 @@ class LaneFilm:
         # In half a second.
         if every[step, round(0.5 / self.dt) - 1, 3] < state[3] - 0.3:
             look = {"ha": "right", "fontweight": "bold", "color": "#d55e00"}
-            _put(axes, Text(1, 1.04, "brakes", fontsize=11, **look, **whole))
+            _put(axes, Text(0.96, 1.04, "brakes", fontsize=11, **look, **whole))
 
 
 def _each(
@@ -329,7 +360,7 @@ def _draw_wind(axes: Any, wind: Any, where: float) -> None:
     """An arrow across the view, as long as the wind is strong."""
     if abs(wind) > 0.1:
         middle = float(np.mean(axes.get_ylim()))
-        ends = [(where, middle + half * wind) for half in (-0.5, 0.5)]
+        ends = [(where, middle + half * wind) for half in (-0.4, 0.4)]
         arrow = {"arrowstyle": "-|>", "color": style.DARK, "lw": 2.5}
         _put(axes, FancyArrowPatch(*ends, mutation_scale=10, **arrow))
 
