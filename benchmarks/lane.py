@@ -2,10 +2,11 @@
 
     python -m benchmarks.lane [--cars dynamic --systems lane --rows random --runs 200]
 
-Systems on the same roads, true cars, S3's schedule and sensor noise: the policy in its
-lane; MPPI that knows the car (oracle), whose plans must keep clear of what is in view;
-the same in the guard along the road. Writes benchmarks/lane.json, one line a row; what
-is there is not measured again.
+Three systems drive the true cars on the same roads, with the schedule and the sensor noise
+of S3: the policy in its lane; MPPI that knows the car (oracle), whose plans must keep clear
+of what is in view; and the same inside the shield and gate of the policy (its guard), along
+the road. The results go to benchmarks/lane.json, one line a row. A row that is there is not
+measured again.
 """
 
 import json
@@ -16,19 +17,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import arguments, as_lines, device, search, total
+from benchmarks import arguments, as_lines, device, search, stamp, total
 from benchmarks.device import CARS, HORIZON, PERIOD, driving
 from benchmarks.recovery import shown
 from sfkd_jax import control, models, scenarios
 from sfkd_jax.lanes import circles, clearance
 from sfkd_jax.types import Controller
 
-STEPS, IN_VIEW = 600, 4
-"""Of a run; obstacles that are shown at once."""
-MARGIN, EDGE = 0.3, 5.25
-"""That MPPI keeps from obstacles; from the middle of the road to its edges [m]."""
-APPEAR, SUDDEN = 40.0, 15.0
-"""Distance at which an enemy's obstacle is seen at the latest, and a pedestrian [m]."""
+STEPS = 600
+"""Of a run."""
+IN_VIEW = 4
+"""Obstacles that are shown at once."""
+MARGIN = 0.3
+"""Distance that MPPI keeps from obstacles [m]."""
+EDGE = 5.25
+"""Distance from the middle of the road to its edges [m]."""
+APPEAR = 40.0
+"""Distance at which an enemy's obstacle is seen at the latest [m]."""
+SUDDEN = 15.0
+"""Distance at which a pedestrian is seen [m]."""
 GUARDED = " in the guard"
 SYSTEMS = ("lane", "oracle", "oracle" + GUARDED)
 
@@ -38,7 +45,8 @@ class Car:
 
     def __init__(self, name, samples):
         self.policy = device.loaded(name, samples)
-        self.plant, self.samples = self.policy.vehicle, samples
+        self.plant = self.policy.vehicle
+        self.samples = samples
 
     def system(self, name):
         """A controller of scenes, whose params are those of the policy."""
@@ -71,24 +79,33 @@ class Car:
             made = episode(scenario, key)
             # From the middle of the road, also where another reference is followed.
             foot = jax.vmap(scenarios.point_at, (None, 0))(scenario.path, made.progress)
-            away, yaw = made.states[1:, :2] - foot[:, :2], foot[:, 2]
+            away = made.states[1:, :2] - foot[:, :2]
+            yaw = foot[:, 2]
             middle = away[:, 1] * jnp.cos(yaw) - away[:, 0] * jnp.sin(yaw)
-            told = {"along": made.progress, "speed": made.states[1:, 3]}
-            told |= {"corridor": jnp.full(STEPS, jnp.nan)} | made.signals
-            return told | {"lateral": made.lateral, "middle": middle}
+            return {
+                "along": made.progress,
+                "speed": made.states[1:, 3],
+                "corridor": jnp.full(STEPS, jnp.nan),
+                **made.signals,
+                "lateral": made.lateral,
+                "middle": middle,
+            }
+
+        alone = jax.jit(run)
+        together = jax.jit(jax.vmap(run))
 
         def drive(roads):
             # The same noise for every system.
             keys = jax.random.split(jax.random.key(36), len(roads.speed))
             if jax.default_backend() != "cpu":
-                return jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(roads, keys))
-            rows = (
-                jax.tree.map(lambda x, i=i: x[i], (roads, keys))
-                for i in range(len(keys))
+                return jax.tree.map(np.asarray, together(roads, keys))
+            runs = (
+                jax.tree.map(lambda leaf, number=number: leaf[number], (roads, keys))
+                for number in range(len(keys))
             )
-            return jax.tree.map(lambda *x: np.stack(x), *(alone(*one) for one in rows))
+            driven = [alone(scenario, key) for scenario, key in runs]
+            return jax.tree.map(lambda *leaves: np.stack(leaves), *driven)
 
-        alone = jax.jit(run)
         return drive
 
 
@@ -105,12 +122,14 @@ def on_road(controller):
     """A controller of references, given the middle of the road and what is in view."""
 
     def act(params, memory, seen, env, scene):
-        (lane, shown), (along, inner) = scene, memory
+        lane, obstacles = scene
+        along, inner = memory
         along, _ = scenarios.project(lane.path, seen[:2], along + 1.0)
         ahead = scenarios.reference_window(
             lane.path, along, lane.speed[0], dt=PERIOD, horizon=HORIZON
         )
-        data = shown.position[:, 0], shown.radius, shown.present.astype(float)
+        present = obstacles.present.astype(float)
+        data = obstacles.position[:, 0], obstacles.radius, present
         inner = control.tuned(inner, constraints=data)
         action, inner, info = controller.act(params, inner, seen, env, ahead)
         return action, (along, inner), info
@@ -126,7 +145,16 @@ def courses(car, count, seed):
 
 
 def placed(roads, along, aside, view, *, radius, until):
-    """The same roads with other obstacles, (run, obstacle); none after `until` [m]."""
+    """The same roads with other obstacles.
+
+    Args:
+        roads: from `courses`.
+        along: arc length of every obstacle [m], (run, obstacle).
+        aside: distance from the middle of the road to the left [m].
+        view: distance at which each is seen first [m].
+        radius: of all of them [m].
+        until: arc length after which there is none [m].
+    """
     along, aside, view = (
         jnp.asarray(np.broadcast_to(one, np.shape(along)), jnp.float32)
         for one in (along, aside, view)
@@ -143,8 +171,11 @@ def placed(roads, along, aside, view, *, radius, until):
 
 def counted(car, made):
     """What a row says about its runs."""
-    gap, far, claim = made["gap"], np.abs(made["lateral"]), made["corridor"]
-    side, nearest = np.abs(made["middle"]) + scenarios.CAR[1], gap.min(axis=1)
+    gap = made["gap"]
+    nearest = gap.min(axis=1)
+    far = np.abs(made["lateral"])
+    claim = made["corridor"]
+    side = np.abs(made["middle"]) + scenarios.CAR[1]
     return {
         "runs": len(gap),
         "collisions": int((nearest < 0.0).sum()),
@@ -162,19 +193,22 @@ def counted(car, made):
     }
 
 
-def random_rows(car, drive, given):
+def random_rows(car, drive, options):
     """Courses of the scenario."""
-    yield "random courses", counted(car, drive(courses(car, given.runs, 35)))
+    yield "random courses", counted(car, drive(courses(car, options.runs, 35)))
 
 
-def pedestrian_rows(car, drive, given):
+def pedestrian_rows(car, drive, options):
     """Somebody steps out onto the road and stands there, once in a run."""
-    draw, roads = np.random.default_rng(37), courses(car, given.runs, 37)
-    half, shape = given.runs // 2, roads.course.along.shape
+    draw = np.random.default_rng(37)
+    roads = courses(car, options.runs, 37)
+    half = options.runs // 2
+    shape = roads.course.along.shape
     along = 90.0 + 200.0 * np.arange(shape[1]) + draw.uniform(0.0, 10.0, (shape[0], 1))
     aside = draw.uniform(-1.5, 1.5, shape)
     envs = np.zeros(roads.envs.shape, np.float32)
-    envs[:half, :, 0], envs[half:, :, 0] = 0.9, 0.3
+    envs[:half, :, 0] = 0.9
+    envs[half:, :, 0] = 0.3
     roads = roads._replace(envs=jnp.asarray(envs), observed_envs=jnp.asarray(envs))
     made = drive(placed(roads, along, aside, SUDDEN, radius=0.3, until=150.0))
     for friction, mine in ((0.9, slice(half)), (0.3, slice(half, None))):
@@ -182,10 +216,12 @@ def pedestrian_rows(car, drive, given):
         yield f"pedestrian, friction {friction}", counted(car, part)
 
 
-def enemy_rows(car, drive, given):
+def enemy_rows(car, drive, options):
     """Places, and when they are seen first, by a cross-entropy search."""
-    draw, base = np.random.default_rng(39), courses(car, given.runs, 39)
-    found, hits = [], []
+    draw = np.random.default_rng(39)
+    base = courses(car, options.runs, 39)
+    found = []
+    hits = []
 
     def roads(genes, latest):
         gaps, sides, sight = np.split(np.clip(genes, -1.0, 1.0), 3, axis=1)
@@ -204,37 +240,51 @@ def enemy_rows(car, drive, given):
         # Of those that come as near, the slower run is worse.
         return -near - 1e-4 * made["along"][:, -1]
 
-    size = given.runs, 3 * base.course.along.shape[1]
-    search(draw, size, given.generations, reward)
-    least = min(one["smallest_clearance_m"] for one in found)
-    whole = total(found) | {"smallest_clearance_m": least, "avoidable": sum(hits)}
+    size = options.runs, 3 * base.course.along.shape[1]
+    search(draw, size, options.generations, reward)
+    whole = total(found)
+    whole["smallest_clearance_m"] = min(one["smallest_clearance_m"] for one in found)
+    whole["avoidable"] = sum(hits)
     yield "enemy", whole
 
 
-def time_rows(car, drive, given):
+def time_rows(car, drive, options):
     """A step of the controller, with a search for a reference and without one."""
-    driver, roads = car.system("lane"), courses(car, 1, 41)
-    path, lane = jax.tree.map(lambda x: x[0], (roads.path, roads.course.lane))
-    along, aside = jnp.asarray([30.0, 55.0, 75.0, 95.0]), jnp.asarray([1.0, -1.0] * 2)
-    place, act = scenarios.beside(path, along, aside), jax.jit(driver.act)
+    driver = car.system("lane")
+    act = jax.jit(driver.act)
+    roads = courses(car, 1, 41)
+    path, lane = jax.tree.map(lambda leaf: leaf[0], (roads.path, roads.course.lane))
+    along = jnp.asarray([30.0, 55.0, 75.0, 95.0])
+    aside = jnp.asarray([1.0, -1.0, 1.0, -1.0])
+    place = scenarios.beside(path, along, aside)
+    params = car.policy.params
+    env = jnp.asarray([0.9, 0.0])
     state = jnp.zeros(len(car.plant.state_names))
     state = state.at[:4].set(path.points[0].at[3].set(10.0))
     for label, steps in (("standing", 1), ("moving", 60)):
         walk = 0.02 * jnp.arange(steps)[:, None] * jnp.asarray([0.0, 1.0])
         seen = circles(place, 0.8)._replace(position=place[:, None] + walk)
-        rest = car.policy.params, state, jnp.asarray([0.9, 0.0]), (lane, seen)
-        _, memory, _ = act(rest[0], driver.init(jax.random.key(0)), *rest[1:])
-        times = []
+        scene = lane, seen
+        first = driver.init(jax.random.key(0))
+        _, memory, _ = act(params, first, state, env, scene)
+        fastest = {}
+        # With a wait of 0 every step searches, with 2 none does.
         for wait in (0, 2):
             began = memory._replace(wait=jnp.asarray(wait))
+            times = []
             for _ in range(300):
                 start = time.perf_counter()
-                jax.block_until_ready(act(rest[0], began, *rest[1:]))
+                jax.block_until_ready(act(params, began, state, env, scene))
                 times.append(1e3 * (time.perf_counter() - start))
-        # The least: other programs on the machine only add.
-        step, without = min(times[:300]), min(times[300:])
-        found = {"step_ms": shown(step, 2), "search_ms": shown(step - without, 2)}
-        yield f"obstacles {label}", found
+            # The least: other programs on the machine only add.
+            fastest[wait] = min(times)
+        yield (
+            f"obstacles {label}",
+            {
+                "step_ms": shown(fastest[0], 2),
+                "search_ms": shown(fastest[0] - fastest[2], 2),
+            },
+        )
 
 
 ROWS = {
@@ -247,7 +297,7 @@ ROWS = {
 
 def main():
     """Drive, print and write."""
-    given = arguments(
+    options = arguments(
         __doc__,
         __file__,
         cars=CARS,
@@ -258,23 +308,28 @@ def main():
         samples=1500,
     )
     began = time.perf_counter()
-    rows = json.loads(given.out.read_text("utf-8")) if given.out.exists() else []
-    about = {"samples": given.samples, "device": jax.devices()[0].device_kind}
+    rows = json.loads(options.out.read_text("utf-8")) if options.out.exists() else []
+    about = {"samples": options.samples, "device": jax.devices()[0].device_kind}
     done = {(row["car"], row["system"], row["group"]) for row in rows}
-    for name, system in product(given.cars, given.systems):
-        missing = [one for one in given.rows if (name, system, one) not in done]
-        missing = [one for one in missing if one != "time" or system == "lane"]
+    for name, system in product(options.cars, options.systems):
+        missing = [
+            group
+            for group in options.rows
+            if (name, system, group) not in done
+            and (group != "time" or system == "lane")
+        ]
         if not missing:
             continue
-        car = Car(name, given.samples)
+        car = Car(name, options.samples)
         drive = car.program(system)
+        made_by = stamp(f"{name}_path")
         for group in missing:
-            for label, found in ROWS[group](car, drive, given):
+            for label, found in ROWS[group](car, drive, options):
                 named = {"car": name, "system": system, "group": group, "row": label}
-                rows.append(named | found | about)
+                rows.append(named | found | about | made_by)
                 print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)
             # After every group: a run that is cut off goes on where it was.
-            given.out.write_text(as_lines(rows) + "\n", "utf-8")
+            options.out.write_text(as_lines(rows) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

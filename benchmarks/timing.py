@@ -2,10 +2,10 @@
 
     python -m benchmarks.timing [--rounds 3 --steps 40 --only NAME ...]
 
-z⁺ = A z + B u + W₃ tanh(W₂ tanh(W₁ [z; u] + b₁) + b₂), y = D₃ tanh(D₂ tanh(D₁ z)),
-cost |y − y_ref|² + 0.01 |u|²; 1500 samples, 20 steps. Every contender has a process of its
-own, in turn; a library that does not import is named and left out. Writes
-benchmarks/timing.json.
+The problem is z⁺ = A z + B u + W₃ tanh(W₂ tanh(W₁ [z; u] + b₁) + b₂),
+y = D₃ tanh(D₂ tanh(D₁ z)), with the cost |y − y_ref|² + 0.01 |u|², 1500 samples and 20 steps.
+Every contender has a process of its own, one after the other. A library that does not
+import is named and left out. The results go to benchmarks/timing.json.
 """
 
 import json
@@ -20,12 +20,25 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from benchmarks import arguments
+from benchmarks import arguments, stamp
 
-RANK, CONTROLS, OUTPUTS, WIDTH = 32, 2, 4, 64
-NOISE, TEMPERATURE, EFFORT = 0.4, 1.0, 0.01
-LOW, HIGH = -2.0, 2.0
-SAMPLES, HORIZON, WARM_UP = 1500, 20, 9
+RANK = 32
+"""Length of the latent state z."""
+CONTROLS = 2
+OUTPUTS = 4
+WIDTH = 64
+"""Of the networks."""
+NOISE = 0.4
+"""Standard deviation of the samples, the same for each control."""
+TEMPERATURE = 1.0
+EFFORT = 0.01
+"""Weight of |u|² in the cost."""
+LOW = -2.0
+HIGH = 2.0
+SAMPLES = 1500
+HORIZON = 20
+WARM_UP = 9
+"""Steps that are not timed."""
 TARGET = np.zeros(OUTPUTS, np.float32)
 START = np.random.default_rng(1).normal(size=RANK).astype(np.float32)
 """The latent state at the first step."""
@@ -79,10 +92,12 @@ def stepping(act, first):
     """`act(memory, z, target) -> u, memory`, jitted, with its memory kept."""
     import jax
 
-    jitted, memory = jax.jit(act), [first]
+    jitted = jax.jit(act)
+    memory = first
 
     def step(z, target):
-        u, memory[0] = jitted(memory[0], z, target)
+        nonlocal memory
+        u, memory = jitted(memory, z, target)
         return np.asarray(u)
 
     return step
@@ -142,11 +157,13 @@ def plain_jax():
         def body(carry, controls):
             costs, states = carry
             states = advance(jnp, w, states, controls)
-            return (costs + charge(jnp, w, states, controls, target), states), None
+            costs = costs + charge(jnp, w, states, controls, target)
+            return (costs, states), None
 
         first = jnp.zeros(SAMPLES), jnp.tile(z, (SAMPLES, 1))
         (costs, _), _ = jax.lax.scan(body, first, plans)
-        plan = jnp.einsum("m,tmc->tc", jax.nn.softmax(-costs / TEMPERATURE), plans)
+        shares = jax.nn.softmax(-costs / TEMPERATURE)
+        plan = jnp.einsum("m,tmc->tc", shares, plans)
         return plan[0], (key, jnp.concatenate([plan[1:], plan[-1:]]))
 
     return stepping(act, (jax.random.key(0), jnp.zeros((HORIZON, CONTROLS))))
@@ -158,7 +175,8 @@ def jax_mppi():
     import jax.numpy as jnp
     from jax_mppi import mppi
 
-    w, ones = on_device(), jnp.ones(CONTROLS)
+    w = on_device()
+    ones = jnp.ones(CONTROLS)
     config, first = mppi.create(
         RANK,
         CONTROLS,
@@ -187,10 +205,15 @@ def pytorch_mppi():
 
     torch.manual_seed(0)
     w = {name: torch.as_tensor(value) for name, value in weights().items()}
-    aim, ones = [None], torch.ones(CONTROLS)
+    ones = torch.ones(CONTROLS)
+    aim = None
+
+    def cost(z, u):
+        return charge(torch, w, z, u, aim)
+
     planner = library.MPPI(
         partial(advance, torch, w),
-        lambda z, u: charge(torch, w, z, u, aim[0]),
+        cost,
         RANK,
         noise_sigma=NOISE**2 * torch.diag(ones),
         num_samples=SAMPLES,
@@ -202,7 +225,8 @@ def pytorch_mppi():
     )
 
     def step(z, target):
-        aim[0] = torch.as_tensor(target)
+        nonlocal aim
+        aim = torch.as_tensor(target)
         return planner.command(torch.as_tensor(z)).numpy()
 
     return step
@@ -218,7 +242,8 @@ def measure(name, steps):
     began = time.perf_counter()
     step = CONTENDERS[name]()
     step(START, TARGET)
-    first, times = time.perf_counter() - began, []
+    first = time.perf_counter() - began
+    times = []
     for _ in range(WARM_UP + steps):
         began = time.perf_counter()
         step(START, TARGET)
@@ -243,13 +268,15 @@ def versions():
 
 def main():
     """Parse, run, write."""
-    given = arguments(__doc__, __file__, rounds=3, steps=40, only=CONTENDERS)
+    options = arguments(__doc__, __file__, rounds=3, steps=40, only=CONTENDERS)
     # Another job beside a benchmark spoils its times: the load says whether there was.
-    load, rounds = os.getloadavg()[0], {name: [] for name in given.only}
-    for _ in range(given.rounds):
-        for name in given.only:
-            rounds[name].append(in_own_process(name, given.steps))
-    rows, left_out = [], {}
+    load = os.getloadavg()[0]
+    rounds = {name: [] for name in options.only}
+    for _ in range(options.rounds):
+        for name in options.only:
+            rounds[name].append(in_own_process(name, options.steps))
+    rows = []
+    left_out = {}
     for name, found in rounds.items():
         if errors := [one["error"] for one in found if "error" in one]:
             left_out[name] = errors[0]
@@ -272,9 +299,10 @@ def main():
         "load": load,
         "versions": versions(),
         "left_out": left_out,
+        **stamp(),
         "rows": rows,
     }
-    given.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+    options.out.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":
