@@ -18,9 +18,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from benchmarks import arguments, device, write
-from benchmarks.device import CARS, HORIZON, NOISE, PERIOD
+from benchmarks.device import CARS, HORIZON, PERIOD
 from sfkd_jax import control, geometry, plants, scenarios
-from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
+from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
 
@@ -30,7 +30,7 @@ PART, PAST, NEAR, LONGEST, POINTS = 50, 51, 100, 600, 1752
 """Steps of a compiled part; readings kept; path points searched to each side; steps of
 the longest runs; points of their roads, which last a quarter longer at 10 m/s.
 """
-DEPARTED, BACK, LANE = 2.0, 0.3, LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
+DEPARTED, BACK = 2.0, 0.3
 """Distance that counts as a departure [m]; as being back [m, rad]; at which a car leaves its
 lane [m].
 """
@@ -96,7 +96,8 @@ class Car:
         self.step = getattr(plants, name)(dt=TICK, substeps=1).step
         self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
         self.states = len(self.loaded.vehicle.state_names)
-        self.noise = np.asarray(NOISE[: self.states], np.float32)
+        self.noise = np.asarray(self.loaded.vehicle.sensor_noise, np.float32)
+        self.room = room_in_lane(self.loaded.vehicle.size)
         # The loaded controller needs no request.
         self.policy = self.program(lambda _: self.loaded.controller)
         self.guarded = self.program(partial(self.asking, guard=True))
@@ -544,7 +545,7 @@ def planner_rows(car, most):
         for label, made in driven(drive, parts).items():
             worst = distance(made).max(axis=1)
             inside = {"inside": shown((worst <= car.corridor).mean(), 4)}
-            lane = {"left_the_lane": int((worst > LANE).sum())}
+            lane = {"left_the_lane": int((worst > car.room).sum())}
             yield f"planner {label}: {way}", claimed(made, car.corridor) | inside | lane
 
 

@@ -16,6 +16,7 @@ asked |= dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
 policy = sfkd_jax.load(f"{sfkd_jax.__path__[0]}/pretrained/{asked['--vehicle']}_path")
 plant, bound = policy.vehicle, policy.certificate["corridor"]
 loop = {"dt": plant.dt, "observation_noise": bound["conditions"]["sensor_noise"]}
+loop["size"] = plant.size
 told = {"inside": "shield_healthy", "reference": "reference", "corridor": "corridor"}
 loop["record"] = {k: lambda info, name=name: info[name] for k, name in told.items()}
 road = {"name": "obstacles", "peak_curvature": 0.004, "wavelengths": (100.0, 300.0)}
@@ -30,7 +31,7 @@ scene, (along, aside) = course(keys[0]), jnp.pad(place, ((0, 0), (0, 11)), "edge
 there = {"position": scenarios.beside(scene.path, along, aside)[:, None]}
 posts = scene.course.obstacles._replace(**there, present=jnp.arange(16) < 5)
 scene = scene._replace(course=scene.course._replace(obstacles=posts, along=along))
-shown = film.LaneFilm(scene, run(scene, keys[0]), dt=plant.dt, car=scenarios.CAR)
+shown = film.LaneFilm(scene, run(scene, keys[0]), dt=plant.dt, car=plant.size.half)
 film.write(Path(asked["--film"]), shown)
 seen, speed = drives.signals, drives.progress[:, -1].mean() / 60.0
 found = {"runs": len(keys), "collisions": (seen["gap"].min(axis=1) < 0.0).sum()}

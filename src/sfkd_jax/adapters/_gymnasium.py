@@ -17,8 +17,8 @@ PROCESS = os.getpid()
 """That imported this file, and started jax; a forked one inherits the number."""
 VIEW = 30.0
 """Half width of the view around the car [m]."""
-CAR = np.asarray([[2.25, 0.9], [2.25, -0.9], [-2.25, -0.9], [-2.25, 0.9]])
-"""Corners of the drawn car ahead and to the left of its centre [m]."""
+CORNERS = np.asarray([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+"""Of a car, ahead and to the left of its centre, in shares of half its size."""
 
 
 def register_gymnasium() -> None:
@@ -154,7 +154,9 @@ def _image(
         axes.plot(*(points[:, :2].T + side * normal), dashes, color="0.6", linewidth=1)
     axes.plot(*np.stack(driven).T, color="C0", linewidth=1.5)
     c, s = np.cos(state[2]), np.sin(state[2])
-    axes.fill(*(state[:2] + CAR @ np.asarray([[c, s], [-s, c]])).T, "C0", alpha=0.6)
+    corners = CORNERS * task.plant.size.half
+    body = state[:2] + corners @ np.asarray([[c, s], [-s, c]])
+    axes.fill(*body.T, "C0", alpha=0.6)
     axes.set_xlim(state[0] - VIEW, state[0] + VIEW)
     axes.set_ylim(state[1] - 0.75 * VIEW, state[1] + 0.75 * VIEW)
     axes.set_title(

@@ -17,7 +17,6 @@ from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
 from sfkd_jax.scenarios import (
-    CAR,
     Course,
     Family,
     Scenario,
@@ -280,11 +279,12 @@ class LaneTask(DrivingTask):
         return {name: -rows for name, rows in high.items()}, high
 
     def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
-        side = moment.lateral * jnp.asarray([1.0, -1.0]) + CAR[1]
-        room = jnp.min(_edges(_course(road), moment.progress) - side)
-        return (room < 0.0) | (
-            car_clearance(_course(road).obstacles, moment.state) < 0.0
-        )
+        course = _course(road)
+        size = self.plant.size
+        side = moment.lateral * jnp.asarray([1.0, -1.0]) + 0.5 * size.width
+        room = jnp.min(_edges(course, moment.progress) - side)
+        gap = car_clearance(course.obstacles, moment.state, size=size)
+        return (room < 0.0) | (gap < 0.0)
 
     def situation(self, road: Scenario, moment: Moment) -> tuple[State, Any, Any]:
         """Return state, environment and scene, what a controller in a lane takes."""

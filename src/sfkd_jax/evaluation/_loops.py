@@ -80,6 +80,7 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: Sequence[float | Scalar] = (),
+    size: tuple[float, float] | None = None,
     record: Mapping[str, Signal] | None = None,
 ) -> Episode:
     """Simulate one episode.
@@ -103,8 +104,14 @@ def simulate(
         horizon: length of the reference window.
         observation_noise: standard deviation per state, entries beyond the state are
             not used; () for none.
+        size: length and width of the car [m], which a course needs.
         record: more signals of every step, by name, besides those of the metrics.
+
+    Raises:
+        ValueError: a course without the size of the car.
     """
+    if scenario.course is not None and size is None:
+        raise ValueError("obstacles on the road need the size of the car: vehicle.size")
     # Sensors have their own stream: two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     wanted = SIGNALS | dict(record or {})
@@ -136,7 +143,8 @@ def simulate(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
         if scenario.course is not None:
-            info["gap"] = car_clearance(ahead[1], state)
+            assert size is not None
+            info["gap"] = car_clearance(ahead[1], state, size=size)
             if "reference" in info:
                 # Where the reference is one step later.
                 follows = info["reference"]
@@ -217,14 +225,14 @@ def disturbed_environment(
 
 def open_loop(
     model: Model, params: Params, trajectories: Trajectory, *, horizon: int
-) -> Float[Array, "horizon 4"]:
+) -> Float[Array, "horizon column"]:
     """Return the RMSE of free-running predictions 1 … horizon steps ahead.
 
     Predictions start at every `horizon`-th step of each trajectory.
 
     Columns: along and across the true heading [m] (so that each axis means the same on
-    every trajectory), yaw [rad], speed [m/s]. In path coordinates: 0, e_y [m], e_ψ
-    [rad], speed [m/s].
+    every trajectory), yaw [rad], and the body state. In path coordinates: 0, e_y [m],
+    e_ψ [rad], and the body state of the vehicle.
 
     Args:
         model: that predicts.
@@ -234,15 +242,16 @@ def open_loop(
     """
     windows = adjacent_windows(trajectories, length=horizon)
 
-    def squares(window: Trajectory) -> Float[Array, "horizon 4"]:
+    def squares(window: Trajectory) -> Float[Array, "horizon column"]:
         predicted = rollout(model, params, window).free
         true = window.states[1:]
         if not model.along_path:
-            return state_errors(predicted, true)[:, :4] ** 2
+            return state_errors(predicted, true) ** 2
         gap = (predicted - true)[:, BODY]
         # Along a path nothing is predicted of the way along it.
         still = jnp.zeros(gap.shape[0])
         yaw = wrap_angle(gap[:, HEADING])
-        return jnp.column_stack([still, gap[:, LATERAL], yaw, gap[:, PATH_SPEED]]) ** 2
+        rest = gap[:, PATH_SPEED:]
+        return jnp.column_stack([still, gap[:, LATERAL], yaw, rest]) ** 2
 
     return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))

@@ -37,8 +37,10 @@ SETTLING = 2.0
 """Start of an episode, not scored because it is the same for every system [s]."""
 LANE_HALF_WIDTH = 1.75
 """[m]"""
-VEHICLE_HALF_WIDTH = 0.9
-"""[m]"""
+MIRROR = 0.1
+"""Width of a mirror [m]. A departure is about the body of the car without its mirrors,
+as the committed departures are; obstacles are kept clear of its whole width.
+"""
 SWITCH = (0.05, 6.0)
 """A larger step of friction [-] or wind [m/s] is a switch; the ramps of gusts reach
 5 m/s a step.
@@ -46,9 +48,10 @@ SWITCH = (0.05, 6.0)
 
 
 class Recording(NamedTuple):
-    """What metrics measure: fields of `Episode` as arrays."""
+    """What metrics measure: fields of `Episode` as arrays, and the size of the car."""
 
     dt: float
+    size: tuple[float, float]  # length and width [m]
     lateral: Float[np.ndarray, "episode time"]
     states: Float[np.ndarray, "episode time_plus_1 state"]
     controls: Float[np.ndarray, "episode time control"]
@@ -121,12 +124,21 @@ def _steering_rate(run: Recording) -> np.ndarray:
     return np.mean(np.abs(np.diff(run.controls[..., 0], axis=1)), axis=1) / run.dt
 
 
+def room_in_lane(size: tuple[float, float]) -> float:
+    """Return the deviation from the middle up to which a car is in its lane [m].
+
+    Args:
+        size: length and width of the car [m].
+    """
+    # The side of the car counts, not its centre.
+    return LANE_HALF_WIDTH - (0.5 * size[1] - MIRROR)
+
+
 def _departed(run: Recording) -> np.ndarray:
     """Whether the car left its lane or a state is not finite."""
     # All states, also those of the start: NaN is never a stay in the lane.
     finite = np.all(np.isfinite(run.states), axis=(1, 2))
-    # The side of the car counts, not its centre.
-    stays = _max_deviation(run) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
+    stays = _max_deviation(run) <= room_in_lane(run.size)
     return ~finite | ~stays
 
 

@@ -22,7 +22,7 @@ from sfkd_jax.build import (
 )
 from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
-from sfkd_jax.plants import described
+from sfkd_jax.plants import KNOWN_STATES, Vehicle, described
 from sfkd_jax.policy import CERTIFICATE
 from sfkd_jax.ranges import (
     Bounds,
@@ -37,8 +37,6 @@ from sfkd_jax.ranges import (
 from sfkd_jax.scenarios import DriveClass
 from sfkd_jax.settings import OneOf, Values, arguments, parse, replace, schema, takes
 
-SENSORS = {"p_x": 0.015, "p_y": 0.015, "yaw": 0.002, "v": 0.03, "v_y": 0.02}
-SENSORS |= {"yaw_rate": 0.002, "steering": 0.001}
 Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """Of an episode; the first two seconds are not scored."""
@@ -179,8 +177,8 @@ class EvaluationSettings:
         episode_s: [s].
         seed: of roads, sensors and samplers.
         systems: "self" and reference systems; none: `train` trains alone.
-        observation_noise: standard deviations by name of the state; by default of a
-            satellite and inertial unit of survey grade. Other states are exact.
+        observation_noise: standard deviations by name of the state; None for that which
+            the vehicle states, see `plants.KNOWN_STATES`. Other states are exact.
         side_forces: side forces that no model knows [N].
     """
 
@@ -188,7 +186,9 @@ class EvaluationSettings:
     episode_s: Seconds = 60.0
     seed: NonNegativeInt = 2026
     systems: Names = ("self", "nominal", "oracle")
-    observation_noise: dict[str, NonNegative] = field(default_factory=SENSORS.copy)
+    observation_noise: dict[str, NonNegative | None] = field(
+        default_factory=partial(dict.fromkeys, KNOWN_STATES)
+    )
     side_forces: Numbers = ()
 
 
@@ -284,15 +284,18 @@ class Settings:
         """The certificate of the run, whether or not it exists."""
         return self.run_dir / CERTIFICATE
 
-    def sensors(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        """Return the noise of the sensors of these states."""
+    def sensors(self, plant: Vehicle) -> tuple[float, ...]:
+        """Return the standard deviations of the sensors of a vehicle, one a state."""
         noise = self.evaluation.observation_noise
-        if unknown := set(noise) - {*names, *SENSORS}:
+        names = plant.state_names
+        # Cars of one comparison may have different ones of the known states.
+        if unknown := set(noise) - {*names, *KNOWN_STATES}:
             raise ValueError(
                 f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
                 f"the states of the vehicle are {', '.join(names)}"
             )
-        return tuple(noise.get(name, 0.0) for name in names)
+        asked = {name: value for name, value in noise.items() if value is not None}
+        return tuple(asked.get(one.name, one.deviation) for one in plant.states)
 
     @property
     def logs(self) -> LogSettings | None:

@@ -133,8 +133,8 @@ def _train(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     space = measure_space(dataset)
     recorded["space"] = space._asdict()
     # That of `restore`, for which everything is then compiled already.
-    _, model = policy.built(recorded)
-    names = settings.environment.names or policy.FRICTION_AND_WIND
+    plant, model = policy.built(recorded)
+    names = settings.environment.names or [one.label for one in plant.environment]
     if settings.environment.is_known and not settings.logs:
         box = in_words(names, dataset.env_low, dataset.env_high)
         store.print_message(f"the model reads e: {box}")
@@ -306,7 +306,7 @@ def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str
             trained.model,
             trained.params,
             trained.law,
-            settings.sensors(plant.state_names),
+            settings.sensors(plant),
         )
         document["corridor"] = certify_corridor(
             loop,

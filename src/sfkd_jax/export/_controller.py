@@ -67,7 +67,7 @@ def write_controller(
     *,
     platforms: tuple[str, ...] = ("cpu", "cuda"),
     lane: Annotated[tuple[int, ...], MayBeEmpty()] = (),
-    car: tuple[Positive, Positive] = (4.5, 2.0),
+    car: tuple[Positive, Positive] | None = None,
     iree: bool = False,
     iree_flags: Names = ("--iree-llvmcpu-target-cpu=host",),
 ) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def write_controller(
         platforms: that the programs are compiled for.
         lane: (points of the road, obstacles, predicted steps of each) for a controller
             that drives in a lane; () for one that follows a reference.
-        car: its length and width [m], for a lane.
+        car: its length and width [m], for a lane; None for those of the vehicle.
         iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
     """
@@ -90,6 +90,7 @@ def write_controller(
         )
     # Everything that can refuse comes before the first file is written.
     ahead = None
+    car = car or trained.vehicle.size
     if lane:
         trained, ahead = in_window(trained, lane, car)
     programs = flat_programs(trained, ahead)

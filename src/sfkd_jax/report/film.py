@@ -16,15 +16,14 @@ from matplotlib.text import Text
 from PIL import Image
 
 from sfkd_jax.evaluation import Episode
-from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
 from sfkd_jax.report.tables import NO_MODEL
 
 SECONDS, EVERY = 13.5, 2
 """Of the episode that are shown; steps that a frame lasts."""
-LANE = LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
-"""Deviation at which a car leaves its lane [m]."""
+_LOST = 0.85
+"""Larger deviations do not set the scale of a film [m]."""
 _HALF = 3.4
 """Half width of the road as drawn [m]."""
 _SPACING = 7.6
@@ -40,7 +39,9 @@ _BEHIND, _AHEAD = 14.0, 28.0
 _MOST, _TRAIL, _COLOURS = 10, 20, 48
 """Largest widening of deviations, steps of a trail, colours of the file."""
 _CAR = np.array([[2.4, 1.8, -2.2, -2.2, 1.8], [0.0, 0.85, 0.85, -0.85, -0.85]])
-"""Corners of a car in its frame [m]."""
+"""Corners of the drawing of a car [m]. It shows where the car points, and is the same
+for all of them: files of episodes do not say how large theirs is.
+"""
 _SIGHT, _SIDE = (-8.0, 34.0), 6.6
 """Of a lane that is seen: behind and ahead of the car, to either side [m]."""
 _OBSTACLE: dict[str, Any] = dict(fc=style.SOFT, ec=style.DARK, lw=0.8)
@@ -121,8 +122,8 @@ class Film:
         self.deviations = [car.lateral[0, :last] for car in cars]
         peaks = [float(np.max(np.abs(one))) for one in self.deviations]
         # A car that leaves its lane would make all others look motionless.
-        shown = [corridor or 0.0, *(one for one in peaks if one <= LANE)]
-        self.largest = max(shown) or LANE
+        shown = [corridor or 0.0, *(one for one in peaks if one <= _LOST)]
+        self.largest = max(shown) or _LOST
         # The same widening for all cars, so that they compare.
         self.factor = factor or int(np.clip(_HALF / self.largest, 1, _MOST))
         self.path = np.asarray(cars[0].path)

@@ -10,9 +10,11 @@ from typing import Any
 import pandas as pd
 
 from sfkd_jax import store
+from sfkd_jax.build import build_vehicle
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
 from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.plants import axes
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import film_of
@@ -41,22 +43,6 @@ _WRITERS = {
     "upper": formats.upper,
 }
 """How templates/certificate.csv says that a value is written."""
-_CAR = ["speed [m/s]", "lateral speed [m/s]", "yaw rate [rad/s]", "steering [rad]"]
-_BODY = {
-    "state": _CAR,
-    "control": ["steering [rad]", "acceleration [m/s²] or speed [m/s]"],
-    "env": ["friction [-]", "side wind [m/s]"],
-}
-_PATH = _BODY | {
-    "state": ["lateral error [m]", "heading error [rad]", *_CAR],
-    "control": [
-        "steering added [rad]",
-        "acceleration added [m/s²]",
-        "curvature [1/m]",
-        "reference speed [m/s]",
-    ],
-}
-"""Axes of the boxes of a certificate, in the frame of the body and of a path."""
 
 
 def write_report(run_dir: Path) -> dict[str, Any]:
@@ -137,7 +123,7 @@ def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Secti
     for title, file, make in (
         ("Closed loop", "results.json", lambda: _scores(results)),
         ("Episodes", "results.json", lambda: drawn(results.get("rows"))),
-        ("Certificate", "certificate.json", lambda: _certified(certificate)),
+        ("Certificate", "certificate.json", lambda: _certified(certificate, policy)),
         ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
         ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
     ):
@@ -187,7 +173,7 @@ def draw_episodes(
     return [*parts, Picture(made, f"Film: {title}")] if made else parts
 
 
-def _certified(record: dict[str, Any]) -> list[Part]:
+def _certified(record: dict[str, Any], policy: dict[str, Any]) -> list[Part]:
     """What holds and on what it rests, then the boxes outside of which it does not."""
     if not record:
         return []
@@ -200,7 +186,7 @@ def _certified(record: dict[str, Any]) -> list[Part]:
         name, place, write, basis = line.split(";")
         shown = _WRITERS[write](dig(record, *place.split(".")))
         quantities |= {name: [shown, basis]} if DASH not in shown else {}
-    for box, known in (_PATH if record.get("corridor") else _BODY).items():
+    for box, known in _axes(record, policy).items():
         # Boxes of logged data name their own axes.
         for axis, name in enumerate(dig(record, "boxes", "names", box) or known):
             side = [dig(record, "boxes", box, end, str(axis)) for end in "01"]
@@ -208,6 +194,21 @@ def _certified(record: dict[str, Any]) -> list[Part]:
     parts: list[Part] = [PROOF]
     parts.append(record_table("Quantity", quantities, "value", "rests on"))
     return [*parts, record_table("Box", boxes, "from", "to")] if boxes else parts
+
+
+def _axes(record: dict[str, Any], policy: dict[str, Any]) -> dict[str, list[str]]:
+    """Names of the axes of every box of a certificate, from the vehicle of a policy."""
+    settings = policy.get("config") or {}
+    vehicle = settings.get("vehicle")
+    if not vehicle:
+        return {}
+    named = axes(
+        build_vehicle(vehicle),
+        # No other certificate has a corridor.
+        along_path=bool(record.get("corridor")),
+    )
+    environment = dig(settings, "environment", "names")
+    return named | ({"env": environment} if environment else {})
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
