@@ -1,16 +1,22 @@
 #!/usr/bin/env bash
-# What to measure when an accelerator is at hand, in parts of at most ten minutes:
+# Measures what an accelerator is good for, in parts of at most ten minutes each:
 #
 #     bash benchmarks/gpu.sh [--small] [root=DIR] controls|speed|train|table ...
 #
-# controls: those of the shipped policies, equal to the CPU's; speed: control steps, episodes at once; train: the main job; table: sfkd-bench-3,
-# which the same command continues. --small measures speed in seconds, to try the script without an accelerator.
+# controls  checks that the shipped policies return the controls that they return on a CPU
+# speed     times control steps, and episodes that are simulated at once
+# train     runs the main job
+# table     drives sfkd-bench-3; the same command continues where it stopped
+#
+# --small makes `speed` a matter of seconds, so that one can try the script without an accelerator.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export PYTHONPATH=${PYTHONPATH:-src}:.
 # With factors of ten bits the controls are others, and no witness of a certificate holds.
 export JAX_DEFAULT_MATMUL_PRECISION=float32
-root=runs/device sizes=(--samples 1500 64 300 1024 4096 16384 65536 --steps 100 --episodes 1024) parts=()
+root=runs/device
+sizes=(--samples 1500 64 300 1024 4096 16384 65536 --steps 100 --episodes 1024)
+parts=()
 for word in "$@"; do
   case $word in
     --small) sizes=(--cars dynamic --samples 16 --steps 5 --episodes 0) ;;

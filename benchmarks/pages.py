@@ -499,6 +499,28 @@ def peers():
     )
 
 
+def foreign_cars():
+    """Errors on CommonRoad's cars over those of MPPI with the textbook bicycle."""
+    found = {
+        (row["row"], row["car"], row["friction"]): row
+        for row in read("experiments/commonroad.json")["rows"]
+    }
+    drivers = {"SFKD": "the policy", "SFKD, adaptive": "the policy, adapting"}
+    places = list(dict.fromkeys((car, friction) for _, car, friction in found))
+    lines = []
+    for system, who in drivers.items():
+        line = [who]
+        for place in places:
+            rows = found[system, *place], found["nominal", *place]
+            error, of_bicycle = (np.mean(row["second_half_mm"]) for row in rows)
+            ratio = f"{error / of_bicycle:.2f}"
+            line.append(measured(ratio, *rows, policy=policy_of("dynamic")))
+        lines.append(line)
+    cars = {"std": "drift car", "mb": "multi-body car"}
+    heads = [f"{cars[car]}, friction {friction}" for car, friction in places]
+    return table(["error over that of MPPI with the bicycle", *heads], lines)
+
+
 # ---- lanes
 
 DRIVERS = {
@@ -558,7 +580,7 @@ BLOCKS = {
     "docs/lane.md": {"lane": lane, "lane_time": lane_time},
     "docs/planner.md": {"timing": timing, "planners": planners},
     "docs/adaptation.md": {"adaptation": adaptation},
-    "docs/results.md": results.TABLES | {"peers": peers},
+    "docs/results.md": results.TABLES | {"peers": peers, "commonroad": foreign_cars},
 }
 """Page -> name of a block -> what fills it."""
 

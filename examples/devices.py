@@ -1,6 +1,11 @@
-"""One planner over several devices: its samples, or the vehicles of a fleet.
+"""One planner is spread over several devices.
 
-XLA_FLAGS=--xla_force_host_platform_device_count=4 python examples/devices.py
+Two ways are shown: the samples of one vehicle are spread, or the vehicles of a fleet
+are. Both give the same controls as one device does. The program prints the time of a
+control step and the operations that each device carries out. Without several devices,
+XLA can show the CPU as four:
+
+    XLA_FLAGS=--xla_force_host_platform_device_count=4 python examples/devices.py
 """
 
 import time
@@ -12,7 +17,8 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 from sfkd_jax import control
 
-DT, HORIZON = 0.1, 20
+DT = 0.1  # control period [s]
+HORIZON = 20
 
 
 def dynamics(params, x, u, env):
@@ -22,48 +28,58 @@ def dynamics(params, x, u, env):
 
 
 def stage(weights, x, u, before, goal):
+    """Cost of a step: the pendulum shall stand."""
     return (1.0 + jnp.cos(x[0])) ** 2 + 0.1 * x[1] ** 2 + 0.01 * u[0] ** 2
 
 
-def measured(function, *given, repeat=20):
-    """What it returns, the compiled program, and the shortest time of a call [ms]."""
-    compiled = jax.jit(function).lower(*given).compile()
-    result, times = jax.block_until_ready(compiled(*given)), []
+def measure(function, *inputs, repeat=20):
+    """Return its result, the compiled program, and the shortest time of a call [ms]."""
+    compiled = jax.jit(function).lower(*inputs).compile()
+    result = jax.block_until_ready(compiled(*inputs))
+    times = []
     for _ in range(repeat):
         began = time.perf_counter()
-        jax.block_until_ready(compiled(*given))
+        jax.block_until_ready(compiled(*inputs))
         times.append(1e3 * (time.perf_counter() - began))
     return result, compiled, min(times)
 
 
 def main(samples=4096, vehicles=16):
-    """Controls, work of each device and time [ms]: on one device, and on all."""
+    """Return controls, program and time [ms]: on one device, and on all of them."""
     task = control.free_task(dynamics, stage, control_low=-5.0, control_high=5.0)
-    settings = {"num_samples": samples, "horizon": HORIZON, "noise_std": (2.0,)}
-    planner = control.mppi(task, temperature=1.0, **settings)
-    act = partial(planner.act, {})
+    planner = control.mppi(
+        task,
+        num_samples=samples,
+        horizon=HORIZON,
+        noise_std=(2.0,),
+        temperature=1.0,
+    )
     goal = jnp.zeros((HORIZON, 1))
 
     def step(memory, x):
-        return act(memory, x, None, goal)[0]
+        return planner.act({}, memory, x, None, goal)[0]
 
-    # Everything is on all devices, except for what the name of an axis spreads.
     count = jax.device_count()
-    axis = partial(jax.make_mesh, (count,), axis_types=(AxisType.Auto,))
-    one = planner.init(jax.random.key(0)), jnp.asarray([0.1, 0.0])
-    results = {"samples, one device": measured(step, *one)}
-    with jax.set_mesh(mesh := axis(("samples",))):
-        everywhere = jax.device_put(one, NamedSharding(mesh, PartitionSpec()))
-        results[f"samples, {count} devices"] = measured(step, *everywhere)
+    mesh_along = partial(jax.make_mesh, (count,), axis_types=(AxisType.Auto,))
+    results = {}
 
-    fleet = (
-        jax.vmap(planner.init)(jax.random.split(jax.random.key(0), vehicles)),
-        jnp.linspace(-1.0, 1.0, 2 * vehicles).reshape(vehicles, 2),
-    )
-    results["vehicles, one device"] = measured(jax.vmap(step), *fleet)
-    mesh = axis(("vehicles",))
+    # The planner spreads its samples over an axis of the mesh that is called "samples".
+    # All that it is given lies on every device.
+    vehicle = planner.init(jax.random.key(0)), jnp.asarray([0.1, 0.0])
+    results["samples, one device"] = measure(step, *vehicle)
+    mesh = mesh_along(("samples",))
+    with jax.set_mesh(mesh):
+        everywhere = jax.device_put(vehicle, NamedSharding(mesh, PartitionSpec()))
+        results[f"samples, {count} devices"] = measure(step, *everywhere)
+
+    # The arrays of a fleet begin with the vehicle, and this axis is spread.
+    keys = jax.random.split(jax.random.key(0), vehicles)
+    states = jnp.linspace(-1.0, 1.0, 2 * vehicles).reshape(vehicles, 2)
+    fleet = jax.vmap(planner.init)(keys), states
+    results["vehicles, one device"] = measure(jax.vmap(step), *fleet)
+    mesh = mesh_along(("vehicles",))
     spread = jax.device_put(fleet, NamedSharding(mesh, PartitionSpec("vehicles")))
-    results[f"vehicles, {count} devices"] = measured(jax.vmap(step), *spread)
+    results[f"vehicles, {count} devices"] = measure(jax.vmap(step), *spread)
     return results
 
 

@@ -1,9 +1,13 @@
-"""A half cheetah runs: the planner rolls out the physics of brax.
+"""A half cheetah runs, planned with the physics of brax itself.
 
-python examples/half_cheetah.py [figure.png]
+The planner rolls out brax's simulator in place of a model: the state is a dataclass of
+brax, and the control is the torque of six joints. The program prints the mean speed.
+It needs the package `brax`.
+
+    python examples/half_cheetah.py [figure.png]
 """
 
-import sys
+import argparse
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +15,8 @@ from brax import envs
 
 from sfkd_jax import control
 
-HORIZON, FLAT = 16, 3.0
+HORIZON = 16
+PITCH_WEIGHT = 3.0  # keeps the trunk level
 CHEETAH = envs.get_environment("halfcheetah", backend="spring")
 
 
@@ -22,11 +27,31 @@ def dynamics(params, state, u, env):
 
 def stage(weights, state, u, before, target):
     """The reward of brax (forward speed and effort), and the pitch of the trunk."""
-    return -state.reward + FLAT * jnp.abs(state.pipeline_state.q[2])
+    pitch = state.pipeline_state.q[2]
+    return -state.reward + PITCH_WEIGHT * jnp.abs(pitch)
+
+
+def draw(path, links):
+    """The skeleton at every seventh step, and the path of the trunk.
+
+    Args:
+        path: of the file.
+        links: positions of the links [m], (time, link, 3).
+    """
+    import matplotlib.pyplot as plt
+
+    _, axes = plt.subplots(figsize=(9, 1.8), layout="constrained")
+    shown = links[::7]
+    for child, parent in enumerate(CHEETAH.sys.link_parents):
+        ends = shown[:, jnp.asarray([max(parent, 0), child])]
+        axes.plot(ends[..., 0].T, ends[..., 2].T, color="tab:blue")
+    axes.plot(links[:, 0, 0], links[:, 0, 2], color="0.6", zorder=0)
+    axes.set(xlabel="x [m]", ylabel="z [m]", aspect="equal", ylim=(0, None))
+    plt.savefig(path, dpi=120, bbox_inches="tight")
 
 
 def main(samples=96, seconds=4.0, figure=None):
-    """Mean speed [m/s]."""
+    """Return the mean speed [m/s]."""
     full = jnp.ones(CHEETAH.action_size)
     task = control.free_task(dynamics, stage, control_low=-full, control_high=full)
     planner = control.mppi(
@@ -44,22 +69,17 @@ def main(samples=96, seconds=4.0, figure=None):
         return (state, memory), state.pipeline_state.x.pos
 
     first = jax.jit(CHEETAH.reset)(jax.random.key(0))
+    start = (first, planner.init(jax.random.key(1)))
     steps = round(seconds / CHEETAH.dt)
-    start = first, planner.init(jax.random.key(1))
-    links = jax.jit(lambda start: jax.lax.scan(step, start, length=steps)[1])(start)
+    run = jax.jit(lambda start: jax.lax.scan(step, start, length=steps)[1])
+    links = run(start)
     if figure:
-        import matplotlib.pyplot as plt
-
-        _, axis = plt.subplots(figsize=(9, 1.8), layout="constrained")
-        every = slice(None, None, 7)
-        for child, parent in enumerate(CHEETAH.sys.link_parents):
-            ends = links[every, jnp.asarray([max(parent, 0), child])]
-            axis.plot(ends[..., 0].T, ends[..., 2].T, color="tab:blue")
-        axis.plot(links[:, 0, 0], links[:, 0, 2], color="0.6", zorder=0)
-        axis.set(xlabel="x [m]", ylabel="z [m]", aspect="equal", ylim=(0, None))
-        plt.savefig(figure, dpi=120, bbox_inches="tight")
+        draw(figure, links)
     return float((links[-1, 0, 0] - links[0, 0, 0]) / seconds)
 
 
 if __name__ == "__main__":
-    print(f"mean speed {main(figure=(*sys.argv, None)[1]):.1f} m/s")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("figure", nargs="?", help="file that the figure goes to")
+    speed = main(figure=parser.parse_args().figure)
+    print(f"mean speed {speed:.1f} m/s")

@@ -1,5 +1,10 @@
-"""MPPI on dynamics of your own: swing up a pendulum that the motor is too weak to lift
-at once.
+"""MPPI plans with dynamics of your own: it swings up a pendulum.
+
+The motor is too weak to lift the pendulum at once, so it has to swing. Dynamics and
+cost are two functions; nothing is learned. The program prints the height that is
+reached at the end, which is 1 where the pendulum stands.
+
+    python examples/mppi_own_dynamics.py
 """
 
 import jax
@@ -7,17 +12,20 @@ import jax.numpy as jnp
 
 from sfkd_jax import control
 
-DT = 0.05
+DT = 0.05  # control period [s]
 
 
-def dynamics(
-    params, state, torque, env
-):  # angle from upright [rad], rate [rad/s]; env is the gravity [m/s²]
+def dynamics(params, state, torque, env):
+    """One step of the angle from upright [rad] and its rate [rad/s].
+
+    The environment is the gravity [m/s²].
+    """
     rate = state[1] + DT * (env[0] * jnp.sin(state[0]) + 3.0 * torque[0])
     return jnp.stack([state[0] + DT * rate, rate])
 
 
 def stage(weights, state, torque, torque_before, target):
+    """Cost of a step; its weights may be changed without compiling again."""
     return (
         weights["angle"] * (1 - jnp.cos(state[0]))
         + weights["rate"] * state[1] ** 2
@@ -26,17 +34,14 @@ def stage(weights, state, torque, torque_before, target):
 
 
 def main(samples: int = 512, steps: int = 120) -> float:
-    """Drive for six seconds from hanging at rest; the height reached at the end, 1 is
-    upright.
-    """
-    weights = {"angle": 1.0, "rate": 0.05}
+    """Drive for six seconds from hanging at rest, and return the height at the end."""
     task = control.free_task(
         dynamics,
         stage,
         dt=DT,
         control_low=(-2.0,),
         control_high=(2.0,),
-        weights=weights,
+        weights={"angle": 1.0, "rate": 0.05},
     )
     planner = control.mppi(
         task,
@@ -55,9 +60,8 @@ def main(samples: int = 512, steps: int = 120) -> float:
         return (dynamics({}, state, torque, gravity), memory), None
 
     start = (jnp.asarray([jnp.pi, 0.0]), planner.init(jax.random.key(0)))
-    (state, _), _ = jax.jit(
-        lambda start: jax.lax.scan(step, start, None, length=steps)
-    )(start)
+    run = jax.jit(lambda start: jax.lax.scan(step, start, None, length=steps))
+    (state, _), _ = run(start)
     return float(jnp.cos(state[0]))
 
 

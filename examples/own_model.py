@@ -1,7 +1,8 @@
-"""A model of your own as a row of the benchmark: the bicycle plus a learned rate.
+"""A model of your own becomes a row of the benchmark: the bicycle plus a learned rate.
 
-docs/results.md has the command that trains and drives it beside SFKD. `space` holds
-mean and scale of body state, control and environment. Arguments named `dt`,
+docs/results.md has the command that trains this model and drives it beside SFKD.
+`corrected_bicycle` is the factory that the command names. Its argument `space` holds
+mean and scale of body state, control and environment. Arguments that are called `dt`,
 `nominal` and `environment` are filled in; all others are set by `model.options`.
 """
 
@@ -12,9 +13,9 @@ from sfkd_jax import models
 
 
 def corrected_bicycle(space, *, nominal, dt, width=32):
-    """The textbook bicycle, plus a learned rate of the body state and the yaw."""
+    """Return the textbook bicycle plus a learned rate of the body state and the yaw."""
     body = space.body_mean.shape[0]
-    inputs = body + 2 + 2
+    inputs = body + 2 + 2  # body state, control, environment
 
     def init(key):
         hidden = jax.random.normal(key, (width, inputs)) / jnp.sqrt(inputs)
@@ -27,8 +28,8 @@ def corrected_bicycle(space, *, nominal, dt, width=32):
         params, env, scaled_env = fiber
         scaled_body = (state[3:] - space.body_mean) / space.body_scale
         scaled_control = (control - space.control_mean) / space.control_scale
-        read = jnp.concatenate([scaled_body, scaled_control, scaled_env])
-        learned = params["out"] @ jnp.tanh(params["hidden"] @ read)
+        features = jnp.concatenate([scaled_body, scaled_control, scaled_env])
+        learned = params["out"] @ jnp.tanh(params["hidden"] @ features)
         rate = nominal(state, control, env)
         return state + dt * rate.at[2:].add(learned)
 

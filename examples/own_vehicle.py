@@ -1,5 +1,10 @@
-"""Your own vehicle as the rollout model: a delivery robot with two driven wheels
-follows an S3 path.
+"""Your own vehicle is the model that the planner rolls out.
+
+A delivery robot with two driven wheels follows an S3 path, on which grip and wind
+switch every 3 s. It takes a step function of the vehicle and a feedback law that the
+planner samples around. The program prints the RMS distance from the path.
+
+    python examples/own_vehicle.py
 """
 
 import jax
@@ -7,12 +12,18 @@ import jax.numpy as jnp
 
 from sfkd_jax import control, evaluation, models, scenarios
 
-DT, TRACK = 0.1, 0.6  # [s], between the wheels [m]
+DT = 0.1  # control period [s]
+TRACK = 0.6  # distance of the wheels [m]
+HORIZON = 15
 
 
 def step(state, action, env):
-    """x = (p_x, p_y, yaw, v, yaw rate); action = (speed difference of the wheels,
-    acceleration); env = (grip, wind).
+    """Return the state one step later.
+
+    Args:
+        state: x, y [m], yaw [rad], speed [m/s], yaw rate [rad/s].
+        action: speed difference of the wheels [m/s], acceleration [m/s²].
+        env: grip [-], side wind [m/s].
     """
     x, y, yaw, v, rate = state
     grip, wind = env
@@ -32,18 +43,25 @@ def law(errors, curvature, speed):
 
 
 def main(samples: int = 256, seconds: float = 15.0) -> float:
-    """RMS distance from the path over an episode [m]."""
-    limits = {"control_low": (-1.0, -2.0), "control_high": (1.0, 2.0)}
-    cost = control.tracking_cost(dt=DT, steering_rate=0.1)
-    task = control.path_tracking(models.physics(step), cost, law, dt=DT, **limits)
-    planner = control.mppi(task, num_samples=samples, horizon=15, noise_std=(0.05, 0.3))
-    family = scenarios.scenario(name="s3", duration=seconds, state_size=5, dt=DT)
+    """Return the RMS distance from the path over an episode [m]."""
+    task = control.path_tracking(
+        models.physics(step),
+        control.tracking_cost(dt=DT, steering_rate=0.1),
+        law,
+        dt=DT,
+        control_low=(-1.0, -2.0),
+        control_high=(1.0, 2.0),
+    )
+    planner = control.mppi(
+        task, num_samples=samples, horizon=HORIZON, noise_std=(0.05, 0.3)
+    )
+    draw_road = scenarios.scenario(name="s3", duration=seconds, state_size=5, dt=DT)
 
     @jax.jit
     def run(road_key, drive_key):
-        road = family(road_key)
+        road = draw_road(road_key)
         return evaluation.simulate(
-            step, planner, {}, road, drive_key, dt=DT, horizon=15
+            step, planner, {}, road, drive_key, dt=DT, horizon=HORIZON
         ).lateral
 
     lateral = run(*jax.random.split(jax.random.key(0)))

@@ -1,6 +1,10 @@
 #!/usr/bin/env bash
-# on_every_core.sh NAME [overrides]: python -m sfkd_jax.compare +experiment=NAME, a process per core, each held to its core:
-# several times faster than one process on all of them. With an accelerator it is one process.
+# Runs a comparison with one process for each core, each held to its core:
+#
+#     bash experiments/on_every_core.sh NAME [Hydra overrides]
+#
+# It is `python -m sfkd_jax.compare +experiment=NAME`, several times faster than one process on all cores. With an
+# accelerator it is one process.
 set -euo pipefail
 name=$1 && shift
 cores=()

@@ -58,9 +58,19 @@ def test_an_example_reaches_its_goal(name, monkeypatch):
 
 
 @pytest.mark.exhaustive
+def test_the_car_in_its_lane_passes_every_obstacle(monkeypatch, tmp_path):
+    film = tmp_path / "lane.gif"
+    result = example("lane", monkeypatch)["main"](runs=1, film=film)
+    assert result["collisions"] == result["clearance_below_claim"] == 0
+    assert result["worst_lateral_m"] < result["corridor_m"]
+    assert film.exists()
+
+
+@pytest.mark.exhaustive
 def test_a_learned_residual_keeps_the_boat_off_the_rocks(monkeypatch):
     results = example("dubins_residual", monkeypatch)["main"](samples=256)
-    (left, gap), (nominal_left, nominal_gap) = results["learned"], results["nominal"]
+    left, gap = results["learned"]
+    nominal_left, nominal_gap = results["nominal"]
     assert left < nominal_left - 0.05
     assert gap > max(0.0, nominal_gap + 0.1)
 
@@ -80,7 +90,8 @@ def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch):
     """
     sizes = {"runs": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
     result = example("brax_pendulum", monkeypatch)["main"](**sizes)
-    proof, rows = result["certificate"], result["rows"]
+    proof = result["certificate"]
+    rows = result["rows"]
     assert proof["valid"]
     assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
     assert len(proof["tube"]["latent"]) == 20
@@ -98,8 +109,11 @@ class StubNode:
     """As much of rclpy.node.Node as the example uses."""
 
     def __init__(self, name):
-        self.name, self.parameters, self.sent, self.timers = name, {}, [], []
-        self.create_subscription = lambda kind, topic, callback, depth: callback
+        self.name = name
+        self.parameters = {}
+        self.sent = []
+        self.timers = []
+        self.create_subscription = lambda message, topic, callback, depth: callback
         stamp = SimpleNamespace(to_msg=lambda: 0)
         self.get_clock = lambda: SimpleNamespace(now=lambda: stamp)
 
@@ -109,7 +123,7 @@ class StubNode:
     def get_parameter(self, name):
         return SimpleNamespace(value=self.parameters[name])
 
-    def create_publisher(self, kind, topic, depth):
+    def create_publisher(self, message, topic, depth):
         return SimpleNamespace(publish=self.sent.append)
 
     def create_timer(self, period, callback):
@@ -169,7 +183,8 @@ def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_bl
     assert period == 0.1
     tick()
     assert node.sent == []
-    odometry, path = Message(), Message()
+    odometry = Message()
+    path = Message()
     odometry.pose.pose = Message(
         position=Message(x=0.0, y=0.3), orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0)
     )
@@ -200,17 +215,17 @@ def test_samples_and_vehicles_spread_over_four_devices_give_the_same_controls():
     script = """if True:
         import numpy as np
         from devices import main
-        from sfkd_jax.control.planners import _planner
-        one, spread, fleet, spread_fleet = main(samples=256, vehicles=8).values()
-        for (u, alone, _), (v, shared, _) in ((one, spread), (fleet, spread_fleet)):
+        from sfkd_jax.control.planners import _rollouts
+        car, spread, fleet, spread_fleet = main(samples=256, vehicles=8).values()
+        for (u, alone, _), (v, shared, _) in ((car, spread), (fleet, spread_fleet)):
             np.testing.assert_allclose(u, v, atol=1e-5)
             work = [p.cost_analysis()["flops"] for p in (alone, shared)]
             assert 0.24 < work[1] / work[0] < 0.27, work
             # Only sums over samples travel, never the samples.
             assert "all-gather" not in shared.as_text()
         assert ["all-reduce" in p[1].as_text() for p in (spread, spread_fleet)] == [1, 0]
-        _planner.TOGETHER = 4_000  # batches of 64 samples, of every device
-        for u, v in zip((one, spread), main(samples=256, vehicles=8).values()):
+        _rollouts.LARGEST_BATCH = 4_000  # batches of 64 samples, of every device
+        for u, v in zip((car, spread), main(samples=256, vehicles=8).values()):
             np.testing.assert_allclose(u[0], v[0], atol=1e-5)
             assert "all-gather" not in v[1].as_text()
     """

@@ -18,6 +18,8 @@ MEASURED = [metric for metric in METRICS if metric.measure]
 SHOWN = [metric for metric in METRICS if metric.label]
 LEVELS = (0.1, 0.2, 0.6, 0.9)
 """Constant deviations of four episodes [m]; the last car leaves its lane."""
+MEAN_SQUARE = (STEPS + 1) * (2 * STEPS + 1) / (6 * STEPS**2)
+"""Of k / STEPS over the steps k = 1, 2, …, STEPS."""
 EXPECTED = {
     # name: (per episode, of the row, of two rows with seeds 0 and 1)
     "rmse_m": (LEVELS, 0.45, 0.45),
@@ -30,7 +32,11 @@ EXPECTED = {
     "collisions": ((0, 0, 0, 1), 1, 2),
     "clearance_m": ((0.8, 0.7, 0.3, -0.05), -0.05, -0.05),
     "below_claim": ((0, 0, 100, 100), 200, 400),
-    "mean_speed_mps": ((0.0, 0.0, 0.0, 0.0), 0.0, 0.0),
+    "mean_speed_mps": (
+        tuple(10.0 * level * MEAN_SQUARE for level in LEVELS),
+        4.5 * MEAN_SQUARE,
+        4.5 * MEAN_SQUARE,
+    ),
 }
 
 
@@ -108,7 +114,11 @@ def batch():
         signals = {"ess": 100.0 * level, "healthy": healthy}
         signals["near"] = np.where(TIME > 10.0, (0.9 - level, -0.05)[level > 0.8], 2.0)
         steering = 0.1 * level * TIME
-        parts.append(episode(np.full(STEPS, level), steering=steering, **signals))
+        # The speed grows with the square of the time: its mean is not its median.
+        states = np.zeros((STEPS + 1, 4))
+        states[:, 3] = 10.0 * level * np.linspace(0.0, 1.0, STEPS + 1) ** 2
+        lateral = np.full(STEPS, level)
+        parts.append(episode(lateral, steering=steering, states=states, **signals))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import pytest
 from composing import settings
 from helpers import any_law, space
@@ -56,7 +57,10 @@ def test_every_controller_builds_on_every_vehicle(vehicle, controller):
     model = build.reference_systems(plant, law)["oracle"].model
     if chosen.controller.planner == "koopman_mpc":  # it needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
-    build.build_controller(chosen.controller, model, plant, law=law)
+    controller = build.build_controller(chosen.controller, model, plant, law=law)
+    state = jax.eval_shape(controller.init, jax.random.key(0))
+    # It starts with a plan of two seconds for steering and acceleration.
+    assert (20, 2) in [leaf.shape for leaf in jax.tree.leaves(state)]
 
 
 def test_every_learned_model_and_every_planner_has_an_option_file():

@@ -236,6 +236,13 @@ def test_figures_of_states_that_are_not_finite(tmp_path):
     broken[:, 40:] = np.nan
     group[0] = group[0]._replace(lateral=broken)
     style.save(tmp_path / "a.png", figures.first_episode, group)
+    errors = figures.first_episode(group).axes[0]
+    missing = [np.isnan(line.get_ydata()) for line in errors.lines]
+    (broken_line,) = (one for one in missing if one.any())
+    # It is drawn until it breaks, and does not set the scale.
+    assert broken_line[40:].all()
+    assert not broken_line[:40].any()
+    assert np.isfinite(errors.get_ylim()).all()
 
 
 def film(size, corridor=None, cars=1, **changes):

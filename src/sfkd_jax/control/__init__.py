@@ -41,8 +41,8 @@ from sfkd_jax.control.tasks._task import free_task as free_task
 from sfkd_jax.control.tasks._task import outside_boxes as outside_boxes
 from sfkd_jax.control.tasks._task import outside_circles as outside_circles
 from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
-from sfkd_jax.control.wrappers._gate import Box as Box
-from sfkd_jax.control.wrappers._gate import Conditions as Conditions
+from sfkd_jax.control.wrappers._conditions import Box as Box
+from sfkd_jax.control.wrappers._conditions import Conditions as Conditions
 from sfkd_jax.control.wrappers._gate import Gate as Gate
 from sfkd_jax.control.wrappers._innovations import WINDOWS as WINDOWS
 from sfkd_jax.control.wrappers._innovations import InnovationTest as InnovationTest
@@ -51,7 +51,7 @@ from sfkd_jax.control.wrappers._innovations import (
 )
 from sfkd_jax.control.wrappers._innovations import innovation_test as innovation_test
 from sfkd_jax.control.wrappers._innovations import turning_rate as turning_rate
-from sfkd_jax.control.wrappers._shield import FILTER_SCALES as FILTER_SCALES
+from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES
+from sfkd_jax.control.wrappers._safety_filter import safety_filter as safety_filter
 from sfkd_jax.control.wrappers._shield import Shield as Shield
-from sfkd_jax.control.wrappers._shield import safety_filter as safety_filter
 from sfkd_jax.geometry import reference_curvature as reference_curvature

@@ -43,24 +43,26 @@ from sfkd_jax.types import (
 )
 
 FORCE_STREAM = 2
-SENSOR_STREAM = 3
-"""Folded into an episode's key; `split` gives the planner and the state sensors the
-streams 0 and 1.
+"""Number that is folded into an episode's key for the random side forces. The streams 0
+and 1 are those of the planner and of the state sensors, which `split` makes.
 """
+SENSOR_STREAM = 3
+"""The same for the errors of the observed environment."""
 LEAST_FRICTION = 0.05
+"""Smallest friction that a faulty sensor shows [-]."""
 
 
 class Episode(NamedTuple):
     """One closed-loop episode.
 
     Attributes:
-        states: x_0 … x_T (time + 1, state).
-        controls: applied (time, control).
-        lateral: signed distance of x_1 … x_T from the path [m], or from the reference
-            that a controller of scenes follows, (time,).
-        progress: arc length reached [m], (time,).
-        signals: what metrics and the caller recorded of every step, by name,
-            (time, …).
+        states: x_0 … x_T, (time + 1, state).
+        controls: applied controls, (time, control).
+        lateral: signed distance of x_1 … x_T from the path [m], (time,). On a course
+            with obstacles it is from the reference that the controller follows.
+        progress: arc length that x_1 … x_T have reached [m], (time,).
+        signals: values that metrics or the caller recorded at every step, by name,
+            each (time, …).
     """
 
     states: Float[Array, "time_plus_1 state"]
@@ -86,13 +88,13 @@ def simulate(
     """Simulate one episode.
 
     The plant is in `scenario.envs`, the controller observes `scenario.observed_envs`.
-    Two systems given the same scenario and key follow the same path in the same
+    Two systems with the same scenario and key follow the same path in the same
     environment, with the same sensor noise and sampling keys.
 
-    On a course the controller is given the scene, lane and obstacles in view, in place
-    of a reference. Two signals tell how near the car comes: `gap`, its true distance
-    from the nearest obstacle [m], and `clearance`, what the controller claimed of it;
-    NaN where there is none.
+    On a course with obstacles the controller receives lane and obstacles in view in
+    place of a reference. Two signals then say how near the car comes: `gap` is its true
+    distance from the nearest obstacle [m], and `clearance` is the distance that the
+    controller claims. Both are NaN where there is no such value.
 
     Args:
         plant: the true step.
@@ -102,8 +104,8 @@ def simulate(
         key: consumed.
         dt: sampling period [s].
         horizon: length of the reference window.
-        observation_noise: standard deviation per state, entries beyond the state are
-            not used; () for none.
+        observation_noise: standard deviation per state. States beyond its length are
+            observed without noise; entries beyond the states are not used.
         size: length and width of the car [m], which a course needs.
         record: more signals of every step, by name, besides those of the metrics.
 
@@ -112,12 +114,11 @@ def simulate(
     """
     if scenario.course is not None and size is None:
         raise ValueError("obstacles on the road need the size of the car: vehicle.size")
-    # Sensors have their own stream: two systems meet the same noise.
+    # Sensors have a key of their own, so that two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
-    wanted = SIGNALS | dict(record or {})
-    known = jnp.asarray(observation_noise, dtype=float)[: len(scenario.initial_state)]
-    # A state that no level is given for is observed as it is.
-    spread = jnp.zeros_like(scenario.initial_state).at[: len(known)].set(known)
+    recorded = SIGNALS | dict(record or {})
+    levels = jnp.asarray(observation_noise, dtype=float)[: len(scenario.initial_state)]
+    spread = jnp.zeros_like(scenario.initial_state).at[: len(levels)].set(levels)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
 
     def step(
@@ -125,7 +126,7 @@ def simulate(
     ) -> tuple[Any, Any]:
         state, progress, memory = carry
         env, observed_env, sensor_key = inputs
-        # Noise reaches the controller, never the truth or the scores.
+        # Noise reaches the controller alone, and neither plant nor scores.
         observation = state + spread * jax.random.normal(sensor_key, state.shape)
         if scenario.course is not None:
             ahead: Any = scenario.course.lane, in_view(scenario.course, progress)
@@ -136,9 +137,9 @@ def simulate(
         control, memory, info = controller.act(
             params, memory, observation, observed_env, ahead
         )
-        # The plant is in e, whatever the controller observed of it.
         state = plant(state, control, env)
-        # The guess moves on at the reference speed, so a loop does not catch it.
+        # The guess moves on at the reference speed. Where the path crosses itself, the
+        # foot point therefore stays on the right branch.
         progress, lateral = project(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
@@ -146,11 +147,11 @@ def simulate(
             assert size is not None
             info["gap"] = car_clearance(ahead[1], state, size=size)
             if "reference" in info:
-                # Where the reference is one step later.
-                follows = info["reference"]
-                bend = curvature_ahead(follows)[0]
-                lateral = path_coordinates(state, follows[0], bend)[LATERAL]
-        signals = {name: signal(info) for name, signal in wanted.items()}
+                # The first point of the reference is where the car should be now.
+                reference = info["reference"]
+                curvature = curvature_ahead(reference)[0]
+                lateral = path_coordinates(state, reference[0], curvature)[LATERAL]
+        signals = {name: signal(info) for name, signal in recorded.items()}
         return (state, progress, memory), (state, control, lateral, progress, signals)
 
     start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
@@ -171,26 +172,28 @@ def observed_environment(
     """Return ê_k = e_{k−d} + b + n_k: delayed, biased, with white noise.
 
     Until the first delayed value arrives, the first value of the episode is observed.
-    Observed friction is at least 0.05.
+    Observed friction is at least 0.05, unless the sensor is perfect.
 
     Args:
         envs: the true environment.
-        key: of the episode, not consumed: its other streams stay what they are.
+        key: of the episode. It is not consumed, so that its other streams stay as they
+            are.
         dt: sampling period [s].
         delay_s: d in seconds.
         noise: standard deviations of friction [-] and wind [m/s].
-        bias: of the same.
+        bias: b of friction [-] and wind [m/s].
     """
     steps = round(delay_s / dt)
-    # Until something arrives, a sensor shows what it showed before the start.
     delayed = jnp.concatenate([jnp.tile(envs[:1], (steps, 1)), envs])[: envs.shape[0]]
     white = jnp.asarray(noise) * jax.random.normal(
         jax.random.fold_in(key, SENSOR_STREAM), envs.shape
     )
     observed = delayed + jnp.asarray(bias) + white
-    # A perfect sensor passes e on as it is, bit for bit, and below 0.05 too.
-    faulty = steps or any(noise) or any(bias)
-    return observed.at[:, 0].max(LEAST_FRICTION) if faulty else envs
+    perfect = steps == 0 and not any(noise) and not any(bias)
+    # A perfect sensor passes e on bit for bit, even if the friction is below 0.05.
+    if perfect:
+        return envs
+    return observed.at[:, 0].max(LEAST_FRICTION)
 
 
 def disturbed_environment(
@@ -205,8 +208,12 @@ def disturbed_environment(
     Args:
         plant: whose wind force it is.
         envs: the environment without these forces.
-        key: of the episode, not consumed: its other streams stay what they are.
+        key: of the episode. It is not consumed, so that its other streams stay as they
+            are.
         largest: F, forces lie in [-F, F] [N].
+
+    Raises:
+        ValueError: wind does not act on this plant.
     """
     if not plant.wind_force:
         raise ValueError(
@@ -218,7 +225,7 @@ def disturbed_environment(
         dt=plant.dt,
         largest=largest,
     )
-    # A force is passed on as wind: plants have no other input from the side.
+    # Plants have no other input from the side than wind.
     wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
     return envs.at[:, 1].set(wind(envs[:, 1], force))
 
@@ -230,28 +237,30 @@ def open_loop(
 
     Predictions start at every `horizon`-th step of each trajectory.
 
-    Columns: along and across the true heading [m] (so that each axis means the same on
-    every trajectory), yaw [rad], and the body state. In path coordinates: 0, e_y [m],
-    e_ψ [rad], and the body state of the vehicle.
+    The columns are the errors along and across the true heading [m], so that each axis
+    means the same on every trajectory, of the yaw [rad] and of the body state. In path
+    coordinates they are 0 and the errors of e_y [m], e_ψ [rad] and the body state.
 
     Args:
         model: that predicts.
         params: of the model.
         trajectories: held out from training.
-        horizon: steps.
+        horizon: length of a prediction [steps].
     """
     windows = adjacent_windows(trajectories, length=horizon)
 
-    def squares(window: Trajectory) -> Float[Array, "horizon column"]:
+    def squared_errors(window: Trajectory) -> Float[Array, "horizon column"]:
         predicted = rollout(model, params, window).free
         true = window.states[1:]
         if not model.along_path:
             return state_errors(predicted, true) ** 2
-        gap = (predicted - true)[:, BODY]
-        # Along a path nothing is predicted of the way along it.
-        still = jnp.zeros(gap.shape[0])
-        yaw = wrap_angle(gap[:, HEADING])
-        rest = gap[:, PATH_SPEED:]
-        return jnp.column_stack([still, gap[:, LATERAL], yaw, rest]) ** 2
+        error = (predicted - true)[:, BODY]
+        # A model in path coordinates does not predict the position along the path.
+        along = jnp.zeros(error.shape[0])
+        lateral = error[:, LATERAL]
+        heading = wrap_angle(error[:, HEADING])
+        body = error[:, PATH_SPEED:]
+        return jnp.column_stack([along, lateral, heading, body]) ** 2
 
-    return jnp.sqrt(jnp.mean(in_batches(jax.vmap(squares), windows, size=128), axis=0))
+    squares = in_batches(jax.vmap(squared_errors), windows, size=128)
+    return jnp.sqrt(jnp.mean(squares, axis=0))

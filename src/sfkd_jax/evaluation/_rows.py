@@ -19,14 +19,14 @@ from sfkd_jax.evaluation.metrics import (
 )
 
 SHARED = ("scenario", "vehicle", "inner_loop", "controller", "planner", "sampling")
-"""Columns that are equal in rows that are compared."""
+"""Columns in which rows that are compared must be equal."""
 IDENTITY = ("system", *SHARED, "env")
-"""Columns that identify a row of results.json; a new row replaces the old row of the
+"""Columns that identify a row of results.json. A new row replaces the old row with the
 same identity.
 """
 
 Scores: TypeAlias = dict[str, PerEpisode]
-"""Numbers per episode by the name of their metric."""
+"""One value per episode, by the name of the metric."""
 
 
 def score(episodes: Episode, *, dt: float, size: tuple[float, float]) -> Scores:
@@ -45,28 +45,40 @@ def score(episodes: Episode, *, dt: float, size: tuple[float, float]) -> Scores:
         controls=np.asarray(episodes.controls),
         signals={name: np.asarray(episodes.signals[name]) for name in SIGNALS},
     )
-    return {one.name: one.measure(recording) for one in METRICS if one.measure}
+    return {
+        metric.name: metric.measure(recording) for metric in METRICS if metric.measure
+    }
 
 
-def row(scores: Scores, about: dict[str, Any]) -> Row:
-    """One system on one scenario; what does not apply is None.
+def row(scores: Scores, columns: dict[str, Any]) -> Row:
+    """Return the row of one system on one scenario; what does not apply is None.
 
     Args:
         scores: per episode.
-        about: system, model, controller, sampling, env, scenario, vehicle, seeds,
-            episodes, episode_s, params.
+        columns: what identifies and describes the row: system, model, controller,
+            sampling, env, scenario, vehicle, seeds, episodes, episode_s, params.
     """
-    compared = dict.fromkeys(("ratio_to_oracle", "difference_to_sfkd"))
-    return about | _pooled(scores) | compared
+    # `compare` fills these in, as soon as there are rows to compare with.
+    comparisons = dict.fromkeys(("ratio_to_oracle", "difference_to_sfkd"))
+    return {**columns, **_pooled(scores), **comparisons}
 
 
 def _pooled(scores: Scores) -> Row:
-    """The values of all metrics that are measured on episodes."""
-    return {one.name: one.pool(scores[one.name]) for one in METRICS if one.pool}
+    """Return the values of all metrics that are measured on episodes."""
+    return {
+        metric.name: metric.pool(scores[metric.name])
+        for metric in METRICS
+        if metric.pool
+    }
 
 
 def disturbed(force: float, scores: Scores) -> dict[str, Any]:
-    """The part of a row that is also measured under side forces up to `force` [N]."""
+    """Return the part of a row about the same episodes with side forces.
+
+    Args:
+        force: largest side force [N].
+        scores: per episode, under these forces.
+    """
     pooled = _pooled(scores)
     return {
         "force_n": force,
@@ -78,41 +90,60 @@ def disturbed(force: float, scores: Scores) -> dict[str, Any]:
 def compare(rows: list[Row], *, missing: int = 0) -> list[Row]:
     """Add comparisons of systems on the same episodes with the same sampling.
 
-    A row without sampling (a quadratic program) is compared with rows that sample
-    around feedback. Of several rows of a system, the one with the same controller and
-    planner is taken. `p_holm` of the differences to SFKD is adjusted for all rows.
+    Every row is compared with the row of the oracle and with that of SFKD. If such a
+    system has several rows, the one with the same controller and planner is taken. A
+    row without sampling, of a quadratic program, is compared with rows that sample
+    around feedback. `p_holm` of the differences to SFKD is adjusted for all rows.
 
     Args:
-        rows: of evaluated systems; `drives`, if they have it, tells which episodes.
+        rows: of evaluated systems. Their entry `drives`, if they have it, says which
+            episodes they drove.
         missing: number of rows of the same comparison that are not there yet.
     """
     for entry in rows:
-        same = [other for other in rows if _episodes(other) == _episodes(entry)]
-        # Of several rows of a system, the one that searches like this row.
-        same.sort(key=lambda other, entry=entry: _search(other) != _search(entry))
-        first = {other["system"]: other for other in reversed(same)}
-        if oracle := first.get("oracle"):
-            means = [float(np.mean(_by_seed(one))) for one in (entry, oracle)]
-            entry["ratio_to_oracle"] = means[0] / means[1]
-        # In the frame of the body or in that of a path; one sampling has one frame.
-        ours = first.get("sfkd", first.get("sfkd_path"))
-        if ours is not None and ours is not entry:
-            errors = _by_seed(entry), _by_seed(ours)
-            entry["difference_to_sfkd"] = paired_difference(*errors)
-    # One family: every difference that a reader could pick from the table.
+        systems = _comparable(entry, rows)
+        oracle = systems.get("oracle")
+        if oracle is not None:
+            error = float(np.mean(_by_seed(entry)))
+            oracle_error = float(np.mean(_by_seed(oracle)))
+            entry["ratio_to_oracle"] = error / oracle_error
+        # SFKD in the frame of the body or in that of a path. All rows of one sampling
+        # have the same frame, so that at most one of them is there.
+        sfkd = systems.get("sfkd", systems.get("sfkd_path"))
+        if sfkd is not None and sfkd is not entry:
+            entry["difference_to_sfkd"] = paired_difference(
+                _by_seed(entry), _by_seed(sfkd)
+            )
+    # All differences are one family, since a reader could pick any from the table.
     differences = [entry.get("difference_to_sfkd") or {} for entry in rows]
-    family = [one for one in differences if one.get("p") is not None]
-    adjusted = holm([one["p"] for one in family], not_made=missing)
+    family = [record for record in differences if record.get("p") is not None]
+    adjusted = holm([record["p"] for record in family], not_made=missing)
     for record, p in zip(family, adjusted, strict=True):
         record["p_holm"] = p
     return rows
 
 
+def _comparable(entry: Row, rows: list[Row]) -> dict[str, Row]:
+    """Return one row of each system on the same episodes, by the name of the system.
+
+    Of several rows of a system it is the first one that searches like `entry`, or else
+    the first one.
+    """
+    same = [other for other in rows if _episodes(other) == _episodes(entry)]
+    alike = [other for other in same if _search(other) == _search(entry)]
+    others = [other for other in same if _search(other) != _search(entry)]
+    systems: dict[str, Row] = {}
+    for other in (*alike, *others):
+        systems.setdefault(other["system"], other)
+    return systems
+
+
 def _episodes(entry: Row) -> tuple[Any, ...]:
-    """Key of the episodes of a row; rows with equal keys are paired."""
+    """Return what identifies the episodes of a row; rows with equal keys are paired."""
     return (
-        *(entry[name] for name in ("scenario", "vehicle")),
-        # A quadratic program has no sampling; it starts from feedback too.
+        entry["scenario"],
+        entry["vehicle"],
+        # A quadratic program has no sampling. It starts from feedback, too.
         entry["sampling"] or "feedback",
         entry.get("drives"),
         _by_seed(entry).shape[1],
@@ -120,38 +151,39 @@ def _episodes(entry: Row) -> tuple[Any, ...]:
 
 
 def _search(entry: Row) -> tuple[Any, ...]:
-    """Controller and planner of a row."""
+    """Return controller and planner of a row."""
     return entry.get("controller"), entry.get("planner")
 
 
 def _by_seed(entry: Row) -> np.ndarray:
-    """RMSE, one line per training seed, one column per episode."""
+    """Return the RMSE, one line per training seed, one column per episode [m]."""
     return as_numbers(entry["rmse_episodes_m"]).reshape(len(entry["seeds"]), -1)
 
 
 def pool(rows: list[Row]) -> Row:
     """Pool rows of the same episodes that differ in the training seed alone.
 
-    Metrics are pooled as in their table, by default averaged.
+    A metric with `pool_seeds` is pooled by it. All other numbers are averaged.
     """
-    first, *rest = rows
-    if not rest:
+    first = rows[0]
+    if len(rows) == 1:
         return first
-    # What is named pools otherwise than by the mean, so it comes last.
-    return _mean(rows) | {
-        "arrays": first.get("arrays"),
-        "seeds": [seed for entry in rows for seed in entry["seeds"]],
-        **{one.name: one.pool_seeds(rows) for one in METRICS if one.pool_seeds},
-    }
+    pooled = _mean(rows)
+    pooled["arrays"] = first.get("arrays")
+    pooled["seeds"] = [seed for entry in rows for seed in entry["seeds"]]
+    for metric in METRICS:
+        if metric.pool_seeds is not None:
+            pooled[metric.name] = metric.pool_seeds(rows)
+    return pooled
 
 
 def _mean(values: list[Any]) -> Any:
-    """The mean of equal structures, leaf by leaf.
+    """Return the mean of values of equal structure, leaf by leaf.
 
-    A leaf that is not a number stays where all agree and is None otherwise.
+    A leaf that is not a float stays as it is if all values agree, otherwise it is None.
     """
     first = values[0]
-    # A mean over some of the seeds would not be that of the row.
+    # A mean over some of the seeds would not be the mean of the row.
     if any(value is None for value in values):
         return None
     if isinstance(first, dict):
@@ -163,15 +195,18 @@ def _mean(values: list[Any]) -> Any:
 
 def identity(row: Mapping[str, Any]) -> dict[str, str | None]:
     """Return the identity of a row."""
-    columns = ((name, row.get(name)) for name in IDENTITY)
-    return {name: None if value is None else str(value) for name, value in columns}
+    values = {name: row.get(name) for name in IDENTITY}
+    return {
+        name: None if value is None else str(value) for name, value in values.items()
+    }
 
 
 def merge(
     old: Iterable[Mapping[str, Any]], new: Iterable[Mapping[str, Any]]
 ) -> list[Any]:
     """Return old and new rows; a new row replaces the old row of the same identity."""
-    # Twice over: an iterator would be empty the second time.
-    fresh = list(new)
-    replaced = [identity(row) for row in fresh]
-    return [row for row in old if identity(row) not in replaced] + fresh
+    # A list, because it is read twice and `new` may be an iterator.
+    new_rows = list(new)
+    replaced = [identity(row) for row in new_rows]
+    kept = [row for row in old if identity(row) not in replaced]
+    return kept + new_rows

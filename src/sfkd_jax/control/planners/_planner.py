@@ -76,6 +76,15 @@ class ChosenPlan(NamedTuple):
     states: Any
     violation: Scalar | None
 
+    def constraint_info(self) -> dict[str, Any]:
+        """Return the entries of `info` about constraints; none without constraints."""
+        if self.violation is None:
+            return {}
+        return {
+            "violation": self.violation,
+            "constraints_kept": self.violation <= 0.0,
+        }
+
 
 class SearchResult(NamedTuple):
     """The outcome of a search.
@@ -199,7 +208,8 @@ class Planner(Stateful):
         result = self.search(search_key, before, tuning, evaluate)
         chosen = self._choose(result, evaluate)
 
-        # Otherwise the last healthy plan goes on: it was shifted, and its end is held.
+        # If the step is not healthy, the last healthy plan goes on: it was shifted, and
+        # its end is held.
         healthy = clean & result.usable & jnp.isfinite(chosen.cost)
         plan = jnp.where(healthy, chosen.plan, before)
         controls = jnp.where(healthy, chosen.controls, controls_before)
@@ -215,23 +225,20 @@ class Planner(Stateful):
             key=jax.random.key_data(next_key),
             tuning=tuning._replace(elapsed=jnp.ones_like(tuning.elapsed)),
         )
-        unclipped = jnp.asarray(True) if inside is env else jnp.all(inside == env)
+        env_inside = jnp.asarray(True) if inside is env else jnp.all(inside == env)
         info: ControllerInfo = {
             "cost": result.cost,
             "mean_cost": chosen.cost,
             "effective_samples": result.effective_samples,
             "healthy": healthy & setup.followable,
-            "env_inside": unclipped,
+            "env_inside": env_inside,
             "predicted_states": chosen.states,
         }
         if precise is not None:
             # A coarse plan is driven, not replaced: it is better than the last one.
             info["precision"] = precise
             info["healthy"] = info["healthy"] & precise
-        if chosen.violation is not None:
-            info["violation"] = chosen.violation
-            info["constraints_kept"] = chosen.violation <= 0.0
-        return control, after, info
+        return control, after, {**info, **chosen.constraint_info()}
 
     def _nearest(self, env: Any) -> Any:
         """Return the environment, clipped to its box if there is one."""
