@@ -23,8 +23,8 @@ system [s].
 LANE_HALF_WIDTH = 1.75
 """Half width of the lane that a car has to stay in [m]."""
 MIRROR = 0.1
-"""Width of a mirror [m]. The body without mirrors has to stay in the lane, and committed
-departures are counted so; the whole width has to keep clear of obstacles.
+"""Width of a mirror [m]. The body without mirrors has to stay in the lane, and this is
+how committed departures were counted; the whole width has to keep clear of obstacles.
 """
 SWITCH = (0.05, 6.0)
 """Change of friction [-] and of wind [m/s] in a step from which on it is a switch. The
