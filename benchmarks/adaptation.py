@@ -2,8 +2,9 @@
 
     python -m benchmarks.adaptation [--cars dynamic --cases NAME ... --episodes 16]
 
-Law, planner and roads are equal in all rows of a case; no shield. Every setting was chosen
-on episodes of seed 100. Writes benchmarks/adaptation.json, one line a row.
+All rows of a case have the same law, the same planner and the same roads, and none has a
+shield. Every setting was chosen on episodes of seed 100. The results go to
+benchmarks/adaptation.json, one line a row.
 """
 
 import json
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from benchmarks import arguments, write
+from benchmarks import arguments, stamp, write
 from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
 from sfkd_jax import build, plants, policy
 from sfkd_jax.evaluation.metrics import room_in_lane
@@ -66,11 +67,11 @@ def changed_car(loaded, case):
     return car._replace(step=step) if case.steering else car
 
 
-def roads(plant, case, given):
-    """Scenarios whose `observed_envs` lack what nobody measures, and keys."""
-    sample = family(plant, case.scenario, given.seconds, speed=10.0)
-    road_key, drive_key, force_key = jax.random.split(jax.random.key(given.seed), 3)
-    made = jax.jit(jax.vmap(sample))(jax.random.split(road_key, given.episodes))
+def roads(plant, case, options):
+    """Scenarios whose `observed_envs` lack what nobody measures, and keys of the runs."""
+    sample = family(plant, case.scenario, options.seconds, speed=10.0)
+    road_key, drive_key, force_key = jax.random.split(jax.random.key(options.seed), 3)
+    scenes = jax.jit(jax.vmap(sample))(jax.random.split(road_key, options.episodes))
 
     def disturbed(key, envs):
         forces = random_side_forces(
@@ -79,11 +80,11 @@ def roads(plant, case, given):
         wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
         return envs.at[:, 1].set(wind(envs[:, 1], forces))
 
-    made = made._replace(observed_envs=made.envs)
+    scenes = scenes._replace(observed_envs=scenes.envs)
     if case.force:
-        keys = jax.random.split(force_key, given.episodes)
-        made = made._replace(envs=jax.jit(jax.vmap(disturbed))(keys, made.envs))
-    return made, jax.random.split(drive_key, given.episodes)
+        keys = jax.random.split(force_key, options.episodes)
+        scenes = scenes._replace(envs=jax.jit(jax.vmap(disturbed))(keys, scenes.envs))
+    return scenes, jax.random.split(drive_key, options.episodes)
 
 
 def planner(loaded, model, *, bounded=True, adaptive=False, source="measured"):
@@ -103,33 +104,31 @@ def planner(loaded, model, *, bounded=True, adaptive=False, source="measured"):
 
 def systems(loaded, case, car):
     """Row -> (controller, parameters, whether it observes what nobody measures)."""
-    model, own = loaded.model, loaded.params
+    model = loaded.model
+    params = loaded.params
     # Systems that know a car have its own step as their model.
-    oracle, unknowing = (
-        build.reference_systems(one, loaded.law)["oracle"].model
-        for one in (car, loaded.vehicle)
-    )
+    knowing = build.reference_systems(car, loaded.law)["oracle"].model
+    unknowing = build.reference_systems(loaded.vehicle, loaded.law)["oracle"].model
     source = "estimated" if case.estimate_env else "measured"
     adapting = partial(planner, loaded, adaptive=True, source=source)
-    made = {
-        "oracle that knows": (planner(loaded, oracle, bounded=False), {}, True),
-        "SFKD": (planner(loaded, model), own, False),
-        "SFKD, adaptive": (adapting(model), own, False),
+    rows = {
+        "oracle that knows": (planner(loaded, knowing, bounded=False), {}, True),
+        "SFKD": (planner(loaded, model), params, False),
+        "SFKD, adaptive": (adapting(model), params, False),
     }
     if case.force:
-        made["oracle that does not know"] = (planner(loaded, unknowing), {}, False)
+        rows["oracle that does not know"] = (planner(loaded, unknowing), {}, False)
     if case.estimate_env:
-        made["oracle, e estimated"] = (adapting(unknowing), {}, False)
-    return made
+        rows["oracle, e estimated"] = (adapting(unknowing), {}, False)
+    return rows
 
 
-def drive(car, system, scene):
-    """All episodes of a row at once, in short."""
-    (controller, params, knows), (made, keys) = system, scene
+def drive(car, system, scenes, keys):
+    """Drive all episodes of a row at once, and return its numbers."""
+    controller, params, knows = system
     if knows:
-        made = made._replace(observed_envs=made.envs)
-
-    episodes = jax.jit(jax.vmap(driving(car, controller, params)))(made, keys)
+        scenes = scenes._replace(observed_envs=scenes.envs)
+    episodes = jax.jit(jax.vmap(driving(car, controller, params)))(scenes, keys)
     lateral = np.asarray(episodes.lateral, dtype=np.float64)
     largest = np.abs(lateral).max(axis=1)
     return {
@@ -141,19 +140,22 @@ def drive(car, system, scene):
 
 def main():
     """Drive and write."""
-    protocol, rows = {"episodes": 16, "seconds": 30.0, "seed": 2027}, []
-    given = arguments(__doc__, __file__, cars=CARS, cases=CASES, **protocol)
-    for name in given.cars:
-        loaded = policy.load(SHIPPED / f"{name}_path")
-        for label in given.cases:
+    protocol = {"episodes": 16, "seconds": 30.0, "seed": 2027}
+    options = arguments(__doc__, __file__, cars=CARS, cases=CASES, **protocol)
+    rows = []
+    for name in options.cars:
+        policy_name = f"{name}_path"
+        loaded = policy.load(SHIPPED / policy_name)
+        for label in options.cases:
             case = CASES[label]
             car = changed_car(loaded, case)
-            scene = roads(car, case, given)
+            scenes, keys = roads(car, case, options)
             for row, system in systems(loaded, case, car).items():
                 about = {"car": name, "case": label, "row": row}
-                rows.append(about | drive(car, system, scene))
+                numbers = drive(car, system, scenes, keys)
+                rows.append(about | numbers | stamp(policy_name))
                 print(json.dumps(rows[-1]), flush=True)
-    write(given.out, {key: getattr(given, key) for key in protocol}, rows)
+    write(options.out, {name: getattr(options, name) for name in protocol}, rows)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,15 @@
 """Control steps and parallel episodes of the shipped policies on this device.
 
-python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]: time and
-memory of a jitted control step by the number of samples, and of several also by horizon
-and vehicles; and one-minute S3 episodes simulated at once, with the share that stays in
-the certified corridor. With --planners 16 it drives so many roads with each planner in
-place of that. With XLA_FLAGS=--xla_force_host_platform_device_count=2 it spreads the
-samples over two devices.
+    python -m benchmarks.device [--samples 1500 8192] [--episodes 64] [--out FILE]
+
+measures time and memory of a jitted control step by the number of samples; with several
+numbers also by horizon and by the number of vehicles. Then it simulates one-minute S3
+episodes at once and counts the share that stays in the certified corridor.
+
+    python -m benchmarks.device --planners 16
+
+drives so many roads with each planner instead. With the environment variable
+XLA_FLAGS=--xla_force_host_platform_device_count=2 the samples are spread over two devices.
 """
 
 import json
@@ -18,15 +22,26 @@ import jax.numpy as jnp
 import numpy as np
 
 import sfkd_jax
-from benchmarks import arguments
+from benchmarks import arguments, stamp
 from sfkd_jax import evaluation, scenarios
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
-FEW, AUTO = 300, (jax.sharding.AxisType.Auto,)
-DEFAULTS = dict(samples=[1500], steps=200, episodes=16, planners=0, seed=2026)
-HORIZON, SETTLED, PERIOD = 20, 20, 0.1
-"""Steps of a plan; at the start of an episode that do not count; of the policies [s]."""
+FEW = 300
+"""Samples of each of several vehicles."""
+DEFAULTS = {
+    "samples": [1500],
+    "steps": 200,
+    "episodes": 16,
+    "planners": 0,
+    "seed": 2026,
+}
+PERIOD = 0.1
+"""Of the control [s]."""
+HORIZON = 20
+"""Steps of a plan."""
+SETTLED = 20
+"""Steps at the start of an episode that do not count."""
 PLANNERS = {
     "law alone": {"num_samples": 1},
     "MPPI, 16 samples": {"num_samples": 16},
@@ -43,21 +58,26 @@ ROADS = {"dynamic": "s3", "kinematic": "s2"}
 """Scenarios on which planners are compared."""
 
 
-def loaded(name, samples=1500, *, planner="mppi", **own):
-    """The shipped policy along a path with another planner, or settings of it."""
+def loaded(name, samples=1500, *, planner="mppi", **changes):
+    """The shipped policy along a path with another planner, or with changed settings."""
     directory = SHIPPED / f"{name}_path"
     settings = dict(sfkd_jax.load(directory).settings["controller"])
     shipped = settings.pop("mppi") | {"num_samples": samples}
     if planner != "mppi":
         shipped = {key: shipped[key] for key in ("noise_std", "horizon")}
-    settings |= {"planner": planner, planner: shipped | own}
+    settings |= {"planner": planner, planner: shipped | changes}
     return sfkd_jax.load(directory, controller=settings)
 
 
 def family(plant, name, duration, **options):
-    """A scenario for a vehicle."""
-    about = {"state_size": len(plant.state_names), "dt": plant.dt}
-    return scenarios.scenario(name=name, duration=duration, **about, **options)
+    """A scenario for a vehicle: (key) -> Scenario."""
+    return scenarios.scenario(
+        name=name,
+        duration=duration,
+        state_size=len(plant.state_names),
+        dt=plant.dt,
+        **options,
+    )
 
 
 def driving(plant, controller, params, **options):
@@ -89,32 +109,42 @@ def rmse_mm(lateral):
     return 1e3 * np.sqrt(np.mean(lateral**2, axis=1))
 
 
-def control_step(name, steps, *, vehicles=1, at_once=1, **own):
+def control_step(name, steps, *, vehicles=1, at_once=1, **changes):
     """Time of one control step of one of several vehicles, in batches of `at_once`.
 
     What a single vehicle observes comes from the host, and its control goes back; its
     samples are spread over all devices.
     """
-    policy, keys = loaded(name, **own), jax.random.key(0)
-    horizon, steps = policy.interface["horizon"], max(steps // vehicles, 10)
+    policy = loaded(name, **changes)
+    keys = jax.random.key(0)
+    horizon = policy.interface["horizon"]
+    steps = max(steps // vehicles, 10)
     episode = jax.jit(family(policy.vehicle, "s3", 15.0))(keys)
-    window = partial(scenarios.reference_window, dt=PERIOD, horizon=horizon)
-    ahead = window(episode.path, jnp.zeros(()), episode.speed)
+    ahead = scenarios.reference_window(
+        episode.path, jnp.zeros(()), episode.speed, dt=PERIOD, horizon=horizon
+    )
     seen = episode.initial_state, episode.envs[0], ahead
-    init, act = policy.controller.init, partial(policy.controller.act, policy.params)
+    init = policy.controller.init
+    act_of_one = partial(policy.controller.act, policy.params)
+    act = act_of_one
     if vehicles > 1:
         seen = jax.tree.map(lambda leaf: jnp.stack([leaf] * vehicles), seen)
-        keys, one = jax.random.split(keys, vehicles), act
+        keys = jax.random.split(keys, vehicles)
         init = jax.vmap(init)
 
-        def act(*given):
-            return jax.lax.map(lambda own: one(*own), given, batch_size=at_once)
+        def act(*of_all):
+            return jax.lax.map(
+                lambda inputs: act_of_one(*inputs), of_all, batch_size=at_once
+            )
 
     seen = jax.tree.map(np.asarray, seen)
-    mesh = jax.make_mesh((jax.device_count(),), ("samples",), AUTO)
+    axis_types = (jax.sharding.AxisType.Auto,)
+    mesh = jax.make_mesh((jax.device_count(),), ("samples",), axis_types)
     everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
     # As it comes back, or the second step would compile again.
-    memory, times, jitted = jax.device_put(init(keys), everywhere), [], jax.jit(act)
+    memory = jax.device_put(init(keys), everywhere)
+    jitted = jax.jit(act)
+    times = []
     with jax.set_mesh(mesh):
         needed = jitted.lower(memory, *seen).compile().memory_analysis()
         for _ in range(steps + 5):
@@ -123,7 +153,7 @@ def control_step(name, steps, *, vehicles=1, at_once=1, **own):
             np.asarray(control)
             times.append(1e3 * (time.perf_counter() - start) / vehicles)
     return {
-        "samples": own.get("num_samples"),
+        "samples": changes.get("num_samples"),
         "vehicles": vehicles,
         "at_once": at_once,
         "horizon": horizon,
@@ -148,9 +178,11 @@ def scales(samples):
 
 def episodes(name, samples, count, seed):
     """One-minute episodes of S3, all at once."""
-    policy, seconds = loaded(name, samples), []
+    policy = loaded(name, samples)
     many = fresh_episodes(policy, "s3", 60.0)
     keys = jax.random.split(jax.random.key(seed), count)
+    # The first call compiles.
+    seconds = []
     for _ in range(2):
         began = time.perf_counter()
         lateral = np.abs(many(keys))
@@ -171,42 +203,56 @@ def episodes(name, samples, count, seed):
 
 def compared(name, count, seed):
     """Time of a control step and error of every planner, on the same roads."""
-    keys, law = jax.random.split(jax.random.key(seed), count), None
-    for label, own in PLANNERS.items():
-        took = control_step(name, 200, **own)["median_ms"]
-        drive = fresh_episodes(loaded(name, **own), ROADS[name], 30.0)
+    keys = jax.random.split(jax.random.key(seed), count)
+    errors_of_law = None
+    for label, changes in PLANNERS.items():
+        took = control_step(name, 200, **changes)["median_ms"]
+        drive = fresh_episodes(loaded(name, **changes), ROADS[name], 30.0)
         errors = rmse_mm(drive(keys)[:, SETTLED:])
-        law = errors if law is None else law
-        ratio = errors / law
-        row = {"planner": label, "median_ms": took, "rmse_mm": float(np.mean(errors))}
-        spread = float(np.std(ratio, ddof=1) / np.sqrt(count))
-        yield row | {"over_law": float(np.mean(ratio)), "standard_error": spread}
+        if errors_of_law is None:
+            errors_of_law = errors
+        ratio = errors / errors_of_law
+        yield {
+            "planner": label,
+            "median_ms": took,
+            "rmse_mm": float(np.mean(errors)),
+            "over_law": float(np.mean(ratio)),
+            "standard_error": float(np.std(ratio, ddof=1) / np.sqrt(count)),
+        }
 
 
 def main():
     """Measure, print and store."""
-    asked = arguments(__doc__, __file__, cars=CARS, **DEFAULTS)
+    options = arguments(__doc__, __file__, cars=CARS, **DEFAULTS)
     device = jax.devices()[0].device_kind
     if jax.device_count() > 1:
         device = f"{jax.device_count()} x {device}"
-    for name in asked.cars:
-        if asked.planners:
-            about = asked.planners, asked.seed
-            found = {"roads, seed": about, "planners": list(compared(name, *about))}
+    for name in options.cars:
+        policy = f"{name}_path"
+        made_by = stamp(policy)
+        if options.planners:
+            roads = options.planners, options.seed
+            rows = [row | made_by for row in compared(name, *roads)]
+            found = {"roads, seed": roads, "planners": rows}
         else:
-            step = partial(control_step, name, asked.steps)
-            found = {"control_step": [step(**one) for one in scales(asked.samples)]}
-            if asked.episodes:
-                about = asked.samples[0], asked.episodes, asked.seed
-                found["s3"] = episodes(name, *about)
+            steps = [
+                control_step(name, options.steps, **scale) | made_by
+                for scale in scales(options.samples)
+            ]
+            found = {"control_step": steps}
+            if options.episodes:
+                driven = episodes(
+                    name, options.samples[0], options.episodes, options.seed
+                )
+                found["s3"] = driven | made_by
         print(name, json.dumps(found), flush=True)
         # One file for all devices and cars: what was measured before stays.
-        known = json.loads(asked.out.read_text()) if asked.out.exists() else {}
+        known = json.loads(options.out.read_text()) if options.out.exists() else {}
         about = known.setdefault("devices", {}).setdefault(device, {})
         about["jax"] = jax.__version__
         policies = about.setdefault("policies", {})
-        policies.setdefault(f"{name}_path", {}).update(found)
-        asked.out.write_text(json.dumps(known, indent=1) + "\n")
+        policies.setdefault(policy, {}).update(found)
+        options.out.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
     python -m benchmarks.recovery [--runs 16 --samples 64 --rows starts faults]
 
-The true cars, seen through sensors that fail in named ways, at any call rate. Every run
-is a row of arrays (`Runs`), so that each of three controllers compiles once: the policy,
-a request inside its guard, the same request without one. Writes benchmarks/recovery.json,
-one line a row.
+The cars are the true ones, and their sensors fail in named ways. Every run is a row of
+arrays (`Runs`), so that each of three controllers compiles once: the policy, a request
+inside the shield and gate of the policy (its guard), and the same request without them. The
+results go to benchmarks/recovery.json, one line a row.
 """
 
 import time
@@ -17,28 +17,44 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-from benchmarks import arguments, device, write
+from benchmarks import arguments, device, stamp, write
 from benchmarks.device import CARS, HORIZON, PERIOD
 from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
 
-SPACING, TICK, TICKS = 0.5, 0.02, 5
-"""Of path points [m]; of the cars between calls [s]; as many of them a call."""
-PART, PAST, NEAR, LONGEST, POINTS = 50, 51, 100, 600, 1752
-"""Steps of a compiled part; readings kept; path points searched to each side; steps of
-the longest runs; points of their roads, which last a quarter longer at 10 m/s.
-"""
-DEPARTED, BACK = 2.0, 0.3
-"""Distance that counts as a departure [m]; as being back [m, rad]; at which a car leaves its
-lane [m].
-"""
-KINDS = ("law", "worst", "brake", "linear", "NaN", "lock")
-"""Of requests: law + ν; ν outwards; −6 m/s²; the law of the box without recovery; not a
-number; full lock.
-"""
-REAL, WHOLE = np.float32, np.int32
+SPACING = 0.5
+"""Between points of a path [m]."""
+TICK = 0.02
+"""Step of the simulated cars [s]."""
+TICKS = 5
+"""Of them between two calls of the controller."""
+PART = 50
+"""Calls of a compiled part of a run."""
+PAST = 51
+"""Readings that are kept for a sensor that is late."""
+NEAR = 100
+"""Points of the path that are searched to each side of the last foot."""
+LONGEST = 600
+"""Calls of the longest runs."""
+POINTS = 1752
+"""Of the roads of the longest runs, which last a quarter longer at 10 m/s."""
+DEPARTED = 2.0
+"""Distance from the path that counts as a departure [m]."""
+BACK = 0.3
+"""Distance [m] and heading error [rad] below which a car is back."""
+KINDS = (
+    "law",  # the law + ν
+    "worst",  # ν at its limit, outwards
+    "brake",  # the hardest braking
+    "linear",  # the law of the box, without recovery
+    "NaN",  # not a number
+    "lock",  # full lock
+)
+"""Of requests."""
+REAL = np.float32
+WHOLE = np.int32
 CALL = {
     "env": ((2,), REAL),  # that the car is in
     "told": ((2,), REAL),  # that the controller is told
@@ -62,7 +78,8 @@ points of the path, seed of noise and samples, and what every call meets.
 
 def request(law, low, high, now):
     """A planner along a path that asks for one kind, whatever is measured."""
-    low, high = jnp.asarray(low), jnp.asarray(high)
+    low = jnp.asarray(low)
+    high = jnp.asarray(high)
 
     def act(params, memory, xi, env, preview):
         curvature, speed = preview.road[0]
@@ -92,7 +109,8 @@ class Car:
 
     def __init__(self, name, samples, batch):
         self.loaded = device.loaded(name, samples)
-        self.name, self.batch = name, batch
+        self.name = name
+        self.batch = batch
         self.step = getattr(plants, name)(dt=TICK, substeps=1).step
         self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
         self.states = len(self.loaded.vehicle.state_names)
@@ -105,7 +123,8 @@ class Car:
 
     def asking(self, now, *, guard):
         """A request of `KINDS` in the world, inside the policy's guard or without it."""
-        plant, law = self.loaded.vehicle, self.loaded.law
+        plant = self.loaded.vehicle
+        law = self.loaded.law
         planner = request(law, plant.control_low, plant.control_high, now)
         if guard:
             # The guard is made of numbers, also while a program is traced.
@@ -123,20 +142,29 @@ class Car:
             runs = jax.device_put(runs._replace(now=None))._replace(now=runs.now)
             past = np.repeat(runs.start[:, None], PAST, axis=1)
             number = np.zeros(len(rows), np.int32)
-            carry, parts = (number, runs.start, runs.foot, begin(runs.seed), past), []
-            for at in range(0, steps := runs.now.lost.shape[1], PART):
-                at = np.minimum(at + np.arange(PART), steps - 1)
-                now = jax.tree.map(lambda leaf, at=at: leaf[:, at], runs.now)
+            carry = (number, runs.start, runs.foot, begin(runs.seed), past)
+            steps = runs.now.lost.shape[1]
+            parts = []
+            for first in range(0, steps, PART):
+                calls = np.minimum(first + np.arange(PART), steps - 1)
+                now = jax.tree.map(lambda leaf, calls=calls: leaf[:, calls], runs.now)
                 carry, recorded = part(runs._replace(now=now), carry)
                 parts.append(jax.tree.map(np.asarray, recorded))
-            return jax.tree.map(lambda *p: np.concatenate(p, 1)[:, :steps], *parts)
+            return jax.tree.map(
+                lambda *all_parts: np.concatenate(all_parts, 1)[:, :steps], *parts
+            )
 
         def drive(runs):
             # Batches and parts of one size: every call is the compiled program.
-            count, each = len(runs.seed), np.arange(self.batch)
-            firsts = range(0, count, self.batch)
-            made = [batch(runs, np.minimum(one + each, count - 1)) for one in firsts]
-            return jax.tree.map(lambda *all_: np.concatenate(all_)[:count], *made)
+            count = len(runs.seed)
+            each = np.arange(self.batch)
+            batches = [
+                batch(runs, np.minimum(first + each, count - 1))
+                for first in range(0, count, self.batch)
+            ]
+            return jax.tree.map(
+                lambda *all_batches: np.concatenate(all_batches)[:count], *batches
+            )
 
         return drive
 
@@ -191,15 +219,18 @@ def part_of_run(car, make, runs, carry):
 
 
 def roads(count, seed, conditions=None, bends=None):
-    """Points of paths, (run, point, 4), and schedules of e, (run, 600, 2); S3's own, or
-    others.
+    """Points of paths, (run, point, 4), and schedules of e, (run, 600, 2).
+
+    They are S3's own, but for schedules by `conditions`, (key) -> (600, 2), and for paths
+    whose curvature is `bends` [1/m].
     """
     family = scenarios.scenario(
         name="s3", duration=1.25 * LONGEST * PERIOD, state_size=4, dt=PERIOD
     )
     keys = jax.random.split(jax.random.key(seed), count)
-    made = jax.jit(jax.vmap(family))(keys)
-    points, envs = np.asarray(made.path.points), np.asarray(made.envs)
+    scenes = jax.jit(jax.vmap(family))(keys)
+    points = np.asarray(scenes.path.points)
+    envs = np.asarray(scenes.envs)
     if conditions is not None:
         envs = np.asarray(jax.jit(jax.vmap(conditions))(keys))
     if bends is not None:
@@ -210,18 +241,30 @@ def roads(count, seed, conditions=None, bends=None):
 
 
 def runs_on(car, road, steps, seed, *, foot=0.0, beside=(), **now):
-    """Runs on roads from `foot` [m] on; beside = (e_y, yaw, speed, body …) at the start.
+    """Runs on roads.
 
-    What a call is not given is 0, but v_ref and e; e is told as it is.
+    Args:
+        car: that drives.
+        road: points of paths and schedules of e, from `roads`.
+        steps: calls of a run.
+        seed: of noise and samples.
+        foot: arc length at the start [m].
+        beside: distance to the left [m], heading error [rad], speed [m/s] and body state
+            at the start; entries that are left out are those of a car on its path.
+        now: fields of `Now`, (run, time, …) or what broadcasts to it. What is left out is
+            0, but the reference speed is 10 m/s, e is that of the road, and the controller
+            is told e as it is.
     """
-    (points, envs), count = road, len(road[0])
+    points, envs = road
+    count = len(points)
     # Beyond the schedule the last value of e stays.
-    given = {"speed": 10.0, "env": envs[:, np.minimum(range(steps), LONGEST - 1)]} | now
-    given = {"told": given["env"]} | given
+    schedule = envs[:, np.minimum(range(steps), LONGEST - 1)]
+    fields = {"speed": 10.0, "env": schedule} | now
+    fields = {"told": fields["env"]} | fields
     filled = Now(
         *(
             np.broadcast_to(
-                np.asarray(given.get(name, 0), kind),
+                np.asarray(fields.get(name, 0), kind),
                 (count, steps, *((car.states - 3,) if shape is None else shape)),
             )
             for name, (shape, kind) in CALL.items()
@@ -234,7 +277,8 @@ def runs_on(car, road, steps, seed, *, foot=0.0, beside=(), **now):
     start = np.zeros((count, car.states), np.float32)
     start[:, 0] = here[:, 0] - left * np.sin(here[:, 2])
     start[:, 1] = here[:, 1] + left * np.cos(here[:, 2])
-    start[:, 2], start[:, 3] = here[:, 2] + turned, speed
+    start[:, 2] = here[:, 2] + turned
+    start[:, 3] = speed
     start[:, 4:] = np.transpose(body)
     seeds = np.arange(count) + 1000 * seed
     return Runs(start, foot, road=points.astype(np.float32), seed=seeds, now=filled)
@@ -242,10 +286,15 @@ def runs_on(car, road, steps, seed, *, foot=0.0, beside=(), **now):
 
 def driven(drive, parts):
     """What is recorded of several rows that are driven as one."""
-    ends = np.cumsum([0, *(len(one.seed) for one in parts.values())])
-    made = drive(jax.tree.map(lambda *p: np.concatenate(p), *parts.values()))
-    places = zip(parts, ends, ends[1:], strict=False)
-    return {k: jax.tree.map(lambda leaf: leaf[a:b], made) for k, a, b in places}
+    ends = np.cumsum([0, *(len(runs.seed) for runs in parts.values())])
+    together = jax.tree.map(
+        lambda *all_parts: np.concatenate(all_parts), *parts.values()
+    )
+    made = drive(together)
+    return {
+        label: jax.tree.map(lambda leaf: leaf[first:last], made)
+        for label, first, last in zip(parts, ends, ends[1:], strict=False)
+    }
 
 
 def distance(made):
@@ -260,7 +309,8 @@ def shown(value, digits=3):
 
 def back(made):
     """Whether each run is back at its end, and when it was last away [s]."""
-    away, turned = distance(made) > BACK, np.abs(made["turned"]) > BACK
+    away = distance(made) > BACK
+    turned = np.abs(made["turned"]) > BACK
     settled = ~(away | turned)[:, -20:].any(axis=1)
     last = away.shape[1] - np.argmax(away[:, ::-1], axis=1)
     return settled, PERIOD * np.where(away.any(axis=1), last, 0)
@@ -290,8 +340,11 @@ def returned(made, runs):
 
 
 def claimed(made, corridor):
-    """Steps outside the certified corridor, of them healthy; beyond a claim."""
-    far, healthy = distance(made), made["healthy"]
+    """Steps outside the certified corridor, those of them that are healthy, and steps
+    farther away than `info` claims.
+    """
+    far = distance(made)
+    healthy = made["healthy"]
     whole = {
         "runs": len(far),
         "departures": int((far > DEPARTED).any(axis=1).sum()),
@@ -312,8 +365,9 @@ def claimed(made, corridor):
     }
 
 
-OFFSETS, HEADINGS = np.linspace(-20.0, 20.0, 21), np.linspace(-np.pi, np.pi, 17)
-"""Starts of the figure, at friction 0.6 without wind and 10 m/s."""
+OFFSETS = np.linspace(-20.0, 20.0, 21)
+HEADINGS = np.linspace(-np.pi, np.pi, 17)
+"""Starts of the figure [m, rad], at friction 0.6 without wind and 10 m/s."""
 
 
 def starts(car, most):
@@ -328,7 +382,9 @@ def starts(car, most):
     at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 5)
     at = at[np.linspace(0, len(at) - 1, min(most, len(at))).astype(int)]
     seen = np.stack(np.meshgrid(OFFSETS, HEADINGS, indexing="ij"), -1).reshape(-1, 2)
-    seen, many, random = seen[:most], min(most, 2000), np.random.default_rng(3)
+    seen = seen[:most]
+    many = min(most, 2000)
+    random = np.random.default_rng(3)
     low, high = np.asarray(car.loaded.certificate["boxes"]["state"])[:, 3:]
     beside = random.uniform(
         (-20.0, -np.pi, 2.0, *low), (20.0, np.pi, 12.0, *high), (many, 3 + len(low))
@@ -347,7 +403,8 @@ def starts(car, most):
 
 def start_rows(car, most):
     """Who comes back, from where, and when: planner, law, law of the box."""
-    parts, boxed = starts(car, most), KINDS.index("linear")
+    parts = starts(car, most)
+    boxed = KINDS.index("linear")
     linear = {
         name: one._replace(now=one.now._replace(kind=one.now.kind + boxed))
         for name, one in parts.items()
@@ -370,8 +427,14 @@ FAULTS = ("jump", "alternating", "yaw", "frozen", "late", "lost", "no e")
 
 
 def faulty(car, many, longest):
-    """One fault a run on S3, for `longest` s or up to 2 s (a delay up to 1 s)."""
-    random, fault, steps = np.random.default_rng(4), np.arange(many) % len(FAULTS), 250
+    """Runs on S3 with one fault each, and the number of the fault.
+
+    It lasts `longest` s, or up to 2 s if that is None (readings that are frozen or late:
+    up to 1 s).
+    """
+    random = np.random.default_rng(4)
+    fault = np.arange(many) % len(FAULTS)
+    steps = 250
     is_ = {name: (fault == number)[:, None] for number, name in enumerate(FAULTS)}
     brief = random.uniform(0.1, np.where(is_["frozen"] | is_["late"], 1.0, 2.0))
     length = longest or brief
@@ -404,17 +467,22 @@ def fault_rows(car, most):
         for number, fault in enumerate(FAULTS[: most + 1]):
             mine = faults == number
             made = jax.tree.map(lambda leaf, mine=mine: leaf[mine], whole)
-            spins = (np.abs(made["turned"]) > np.pi / 2).any(axis=1).sum()
-            more = {"spins": int(spins), "back": int(back(made)[0].sum())}
-            yield f"{fault}, {label}", claimed(made, car.corridor) | more
+            found = claimed(made, car.corridor)
+            turned = np.abs(made["turned"]) > np.pi / 2
+            found["spins"] = int(turned.any(axis=1).sum())
+            found["back"] = int(back(made)[0].sum())
+            yield f"{fault}, {label}", found
 
 
 def stop_rows(car, most):
     """Requests to brake at a random time of S3 under the law."""
-    many, steps = min(most, 1000), 200
-    road, onset = roads(many, 5), np.random.default_rng(5).integers(30, 90, (many, 1))
+    many = min(most, 1000)
+    steps = 200
+    road = roads(many, 5)
+    onset = np.random.default_rng(5).integers(30, 90, (many, 1))
+    time_ = np.arange(steps)
     for friction in (0.3, 0.7, "S3"):
-        envs, time_ = road[1][:, :steps].copy(), np.arange(steps)
+        envs = road[1][:, :steps].copy()
         if friction != "S3":
             envs[..., 0] = friction
         asked = np.where(time_ < onset, 0, KINDS.index("brake"))
@@ -478,7 +546,9 @@ ONSET = 60
 
 def detection_rows(car, most):
     """When a steering angle 1° off is found in the class: by the law, and with its ν."""
-    many, steps, random = min(most, 1000), 200, np.random.default_rng(11)
+    many = min(most, 1000)
+    steps = 200
+    random = np.random.default_rng(11)
     runs = in_class(car, many, seed=11)
     runs = runs._replace(now=jax.tree.map(lambda x: x[:, :steps], runs.now))
     about = car.loaded.certificate["corridor"]["conditions"]
@@ -490,19 +560,20 @@ def detection_rows(car, most):
     nu = np.clip(sizes * noise, -1.0, 1.0).astype(np.float32)
     change = np.deg2rad(1.0) * (np.arange(steps) >= ONSET)
     change = runs.now.steering + change * random.choice((-1, 1), (many, 1))
-    law = runs.now._replace(steering=change.astype(REAL))
-    for way, now in (("law", law), ("class", law._replace(nu=nu))):
+    under_law = runs.now._replace(steering=change.astype(REAL))
+    in_the_class = under_law._replace(nu=nu)
+    for way, now in (("law", under_law), ("class", in_the_class)):
         alarm = car.guarded(runs._replace(now=now))["innovation_alarm"]
         found = alarm[:, ONSET + 1 :]
         late = PERIOD * (np.argmax(found, axis=1) + 1.0)
         late = np.where(found.any(axis=1), late, np.inf)
-        half, most_ = np.quantile(late, (0.5, 0.99), method="inverted_cdf")
+        median, slowest = np.quantile(late, (0.5, 0.99), method="inverted_cdf")
         row = {
             "before": int(alarm[:, : ONSET + 1].any(axis=1).sum()),
             "runs": len(late),
             "within_3s": shown((late < 3.05).mean(), 4),
-            "s_50": shown(half, 1),
-            "s_99": shown(most_, 1),
+            "s_50": shown(median, 1),
+            "s_99": shown(slowest, 1),
         }
         yield f"steering offset 1.0 degrees, {way}", row
 
@@ -524,7 +595,8 @@ def table_rows(car, most):
 
 def planner_rows(car, most):
     """Planners that try to drive the car off its road."""
-    random, many = np.random.default_rng(10), min(most, 200)
+    random = np.random.default_rng(10)
+    many = min(most, 200)
     side = random.choice((-1.0, 1.0), (many, 1, 2))
     share = PERIOD * np.arange(LONGEST)[:, None] / random.uniform(1, 8, (many, 1, 1))
     asked = {
@@ -544,9 +616,10 @@ def planner_rows(car, most):
     for way, drive in (("guard", car.guarded), ("bare", car.bare)):
         for label, made in driven(drive, parts).items():
             worst = distance(made).max(axis=1)
-            inside = {"inside": shown((worst <= car.corridor).mean(), 4)}
-            lane = {"left_the_lane": int((worst > car.room).sum())}
-            yield f"planner {label}: {way}", claimed(made, car.corridor) | inside | lane
+            found = claimed(made, car.corridor)
+            found["inside"] = shown((worst <= car.corridor).mean(), 4)
+            found["left_the_lane"] = int((worst > car.room).sum())
+            yield f"planner {label}: {way}", found
 
 
 ROWS = {
@@ -561,7 +634,7 @@ ROWS = {
 
 def main():
     """Drive, print and write."""
-    given = arguments(
+    options = arguments(
         __doc__,
         __file__,
         cars=CARS,
@@ -570,16 +643,18 @@ def main():
         samples=1500,
         batch=16 if jax.default_backend() == "cpu" else 512,
     )
-    head = {"samples": given.samples, "device": jax.devices()[0].device_kind}
-    rows, began = [], time.perf_counter()
-    for name in given.cars:
-        car = Car(name, given.samples, given.batch)
-        for group in given.rows:
-            for label, found in ROWS[group](car, given.runs):
-                rows.append({"car": name, "row": label} | found)
+    head = {"samples": options.samples, "device": jax.devices()[0].device_kind}
+    began = time.perf_counter()
+    rows = []
+    for name in options.cars:
+        car = Car(name, options.samples, options.batch)
+        made_by = stamp(f"{name}_path")
+        for group in options.rows:
+            for label, found in ROWS[group](car, options.runs):
+                rows.append({"car": name, "row": label} | found | made_by)
                 print(f"{time.perf_counter() - began:6.1f} s", rows[-1], flush=True)
             # After every group: a run that is cut off has what it measured.
-            write(given.out, head, rows)
+            write(options.out, head, rows)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,9 @@
-"""What experiments/simulator.sh found, as a line: `python -m experiments.simulator ROOT`."""
+"""What experiments/simulator.sh found, as one line of JSON.
+
+    python -m experiments.simulator ROOT
+
+ROOT is the folder of the runs. The script calls this at its end.
+"""
 
 import json
 import sys
@@ -6,13 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
-PREFIXES = {"nominal": "nominal_mppi_", "law_stanley": "stanley_"}
-PREFIXES |= {"law_pure_pursuit": "pure_pursuit_"}
-"""Of what is printed of a system; ours has none, and "estimated_" where e is."""
+from benchmarks import stamp
+
+PREFIXES = {
+    "nominal": "nominal_mppi_",
+    "law_stanley": "stanley_",
+    "law_pure_pursuit": "pure_pursuit_",
+}
+"""System -> beginning of the names of its numbers; those of the policy have none, and
+"estimated_" where it estimates the environment.
+"""
 
 
 def main():
-    """Print it."""
+    """Print the line."""
     runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
     certificate = json.loads((runs[0] / "certificate.json").read_text("utf-8"))
     corridor = certificate["corridor"]
@@ -28,7 +40,8 @@ def main():
             found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
             found[f"{name}departures"] = row["departures"]
     rounded = {name: np.round(value, 3).tolist() for name, value in found.items()}
-    print(json.dumps({"law": corridor["conditions"]["law_model"]} | rounded))
+    law = {"law": corridor["conditions"]["law_model"]}
+    print(json.dumps(law | rounded | stamp()))
 
 
 if __name__ == "__main__":

@@ -4,14 +4,14 @@ from functools import cache
 
 from hydra import compose, initialize_config_dir
 
-from sfkd_jax.experiment import command, options
+from sfkd_jax.experiment import command, schemas
 from sfkd_jax.store import plain
 
 
 @cache
 def _registered():
     """Hydra's schemas, made once a process."""
-    options.register()
+    schemas.register()
 
 
 @cache

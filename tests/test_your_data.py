@@ -15,6 +15,7 @@ from helpers import last_line, run_command
 import sfkd_jax
 from sfkd_jax import build, collect, evaluate, plants
 from sfkd_jax.experiment import data, identified, runs, stages
+from sfkd_jax.experiment.dataset_files import dataset_config
 from sfkd_jax.store import ArtefactError
 
 sys.path.append(str(Path(__file__).parent / "data"))
@@ -179,7 +180,7 @@ def logged(folder, *more):
 
 
 def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsys):
-    monkeypatch.setattr(identified, "REGRESSION", 400)
+    monkeypatch.setattr(identified, "REGRESSION_STEPS", 400)
     chosen = logged(driven, "vehicle.missing=drop")
     assert "wind is nan, 0.33 % of the rows, dropped" in capsys.readouterr().err
     plant = build.build_vehicle(chosen.vehicle)
@@ -197,7 +198,7 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
     shutil.copytree(driven, moved)
     again = logged(moved, "vehicle.missing=drop")
     assert "fitted" not in capsys.readouterr().err
-    assert data.config(again) == data.config(chosen)
+    assert dataset_config(again) == dataset_config(chosen)
 
 
 @pytest.mark.parametrize(

@@ -28,10 +28,13 @@ def run(settings: Settings) -> dict[str, Any]:
         document = stages.certify_policy(settings)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
-    d_bar = document.get("d_bar", {"value": None})["value"]
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
-    summary = {"certificate": str(path), "reason": None, "d_bar": d_bar}
-    return summary | {key: document.get(key) for key in keys}
+    return {
+        "certificate": str(path),
+        "reason": None,
+        "d_bar": document.get("d_bar", {"value": None})["value"],
+        **{key: document.get(key) for key in keys},
+    }
 
 
 if __name__ == "__main__":

@@ -19,12 +19,13 @@ from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
 
 COUNTS = (5, 10, 20)
-"""Numbers of runs of which the corridor is printed."""
+"""The corridor of so many of the first runs is printed as well."""
 
 
 def run(settings: Settings) -> dict[str, Any]:
     """Write a certificate with the corridor of recorded runs beside that of the run."""
-    folder, level = settings.run_dir, settings.certification.level
+    folder = settings.run_dir
+    level = settings.certification.level
     trained = policy.restore(folder)
     document, reason = policy.read_certificate(folder, trained)
     if document is None or trained.law is None or "corridor" not in document:
@@ -34,22 +35,26 @@ def run(settings: Settings) -> dict[str, Any]:
     count, steps = runs.controls.shape[:2]
     seconds = steps * trained.vehicle.dt
     check_count(count, level, "runs")
-    parts = trained.vehicle, trained.model, trained.params, trained.law
-    scores, lateral = scores_of_runs(closed_loop(*parts, ()), document, runs)
-    known = corridor_coverage(build.corridor_of(document)["bounds"], scores)
+    loop = closed_loop(trained.vehicle, trained.model, trained.params, trained.law, ())
+    scores, lateral = scores_of_runs(loop, document, runs)
+    coverage = corridor_coverage(build.corridor_of(document)["bounds"], scores)
     store.print_message(
         f"{count} runs, cut to the shortest, {seconds:g} s: "
         f"{1e3 * np.sqrt(np.mean(lateral**2)):.1f} mm (RMS) from the path, "
-        f"{known['coverage']:.0%} of them inside the corridor that was known before"
+        f"{coverage['coverage']:.0%} of them inside the corridor that was known before"
     )
-    for some in (number for number in COUNTS if number <= count):
-        at = some / (some + 1) - 1e-9
-        made = calibrate_on_runs(document, scores[:some], at)
+    for number in COUNTS:
+        if number > count:
+            continue
+        # The highest level that so many runs can promise.
+        highest = number / (number + 1) - 1e-9
+        recorded = calibrate_on_runs(document, scores[:number], highest)
         store.print_message(
-            f"after {some} runs: corridor {made['corridor_m']:.3f} m at level {at:.2f}"
+            f"after {number} runs: corridor {recorded['corridor_m']:.3f} m "
+            f"at level {highest:.2f}"
         )
-    made = calibrate_on_runs(document, scores, level)
-    made["conditions"] = {
+    recorded = calibrate_on_runs(document, scores, level)
+    recorded["conditions"] = {
         "runs": count,
         "contents": contents,
         "duration_s": seconds,
@@ -58,8 +63,8 @@ def run(settings: Settings) -> dict[str, Any]:
     path = folder / policy.RECORDED
     if path.exists():
         store.print_message(f"{path} is replaced")
-    store.write_json(path, document | {"recorded": made})
-    return {"certificate": str(path), **made}
+    store.write_json(path, {**document, "recorded": recorded})
+    return {"certificate": str(path), **recorded}
 
 
 if __name__ == "__main__":

@@ -15,26 +15,33 @@ from sfkd_jax.report.run import write_results_page
 def run(settings: Settings) -> dict[str, Any]:
     """Evaluate all cells that are not done, then collect, compare and draw all rows.
 
-    With `comparison.share` this share of the rows is evaluated, and none collected.
+    With `comparison.share` only this share of the rows is evaluated, and no row is
+    collected.
     """
-    began, table = time.perf_counter(), Comparison(settings)
-    done = table.evaluate()
+    began = time.perf_counter()
+    table = Comparison(settings)
+    evaluated = table.evaluate()
     if settings.comparison.share is not None:
-        return {"results": None, "rows": done, "failed": len(table.failed)}
+        return {"results": None, "rows": evaluated, "failed": len(table.failed)}
+    results = table.directory / "results.json"
     with store.locked(table.directory, wait=True):
-        rows, results = table.rows(), table.directory / "results.json"
+        rows = table.rows()
         document = {
             "rows": rows,
-            "config": store.plain(settings) | {"command": command_line("compare")},
+            "config": {**store.plain(settings), "command": command_line("compare")},
             "versions": store.versions(),
             "failed": table.failed,
-            "seconds": time.perf_counter() - began if done else None,
+            "seconds": time.perf_counter() - began if evaluated else None,
         }
         store.write_json(results, document)
         with store.as_artefact_error(table.directory):
             pages = write_results_page(table.directory)
-    summary = {"rows": len(rows), "failed": len(table.failed), **pages}
-    return {"results": str(results)} | summary
+    return {
+        "results": str(results),
+        "rows": len(rows),
+        "failed": len(table.failed),
+        **pages,
+    }
 
 
 if __name__ == "__main__":

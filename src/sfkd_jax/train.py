@@ -17,34 +17,38 @@ def run(settings: Settings) -> dict[str, Any]:
     """Make data, policy, certificate, closed-loop results and report of a run.
 
     A vehicle without a step function is not evaluated in closed loop. With
-    `evaluation.systems=[]` the model is trained alone, as a search needs it.
+    `evaluation.systems=[]` the model is trained and nothing else is done, as a search
+    needs it.
     """
     began = time.perf_counter()
     stages.check_settings(settings)
     with store.locked(settings.run_dir):
-        return _run_stages(settings) | {"seconds": time.perf_counter() - began}
+        summary = _run_stages(settings)
+    summary["seconds"] = time.perf_counter() - began
+    return summary
 
 
 def _run_stages(settings: Settings) -> dict[str, Any]:
-    """Run all stages in the run directory."""
-    trained, run_dir = stages.ensure_policy(settings), settings.run_dir
+    """Run all stages in the run directory; return what was made, by name."""
+    run_dir = settings.run_dir
+    trained = stages.ensure_policy(settings)
     # A policy that exists is not written again, and `load` builds what it says.
-    asked = store.plain(settings.controller)
-    if store.differences(trained.settings["controller"], asked):
+    controller = store.plain(settings.controller)
+    if store.differences(trained.settings["controller"], controller):
         store.print_message(
             f"{run_dir}: the policy keeps the controller that it was trained with; "
             "`load(…, controller=…)` takes another"
         )
     key = "position_rmse_m"
     errors = store.read_json(run_dir / "open_loop.json", keys=(key,))
-    about = {
+    summary = {
         "run": str(run_dir),
         "checkpoint": str(run_dir / "checkpoints"),
         "open_loop_rmse_m": errors[key],
         "objective": errors.get("validation_score"),
     }
     if not settings.evaluation.systems:
-        return about
+        return summary
     certificate = stages.certify_policy(settings)
     results = None
     if build.build_vehicle(settings.vehicle).simulated:
@@ -57,12 +61,11 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     with store.as_artefact_error(run_dir):
         pages = write_report(run_dir)
     store.print_message(f"report: {pages['report']}")
-    return about | {
-        "certificate": str(settings.certificate_path),
-        "results": results,
-        "report": pages["report"],
-        "alpha": certificate.get("alpha"),
-    }
+    summary["certificate"] = str(settings.certificate_path)
+    summary["results"] = results
+    summary["report"] = pages["report"]
+    summary["alpha"] = certificate.get("alpha")
+    return summary
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, segments
 
 from sfkd_jax import data as datasets
-from sfkd_jax.data._dataset import assign_parts
+from sfkd_jax.data._segments import assign_parts
 from sfkd_jax.rollout import windows
 from sfkd_jax.types import Trajectory
 

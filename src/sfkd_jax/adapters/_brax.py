@@ -20,7 +20,7 @@ SCALED = {
     "damping": ("dof.damping",),
     "motor": ("actuator.gear",),
 }
-"""Parameters that entries of e may scale, and their fields in a system; damping is the
+"""Parameters that entries of e may scale -> their fields in a system. Damping is the
 viscous friction of all joints.
 """
 
@@ -41,8 +41,9 @@ class BraxVehicle(Env):
     def reset(self, rng: jax.Array) -> BraxState:
         """Start an episode on a new road; `rng` is a typed key or two integers."""
         # brax still passes keys as integers.
-        typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
-        road, moment = self.task.reset(rng if typed else jax.random.wrap_key_data(rng))
+        is_typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        key = rng if is_typed else jax.random.wrap_key_data(rng)
+        road, moment = self.task.reset(key)
         zero = jnp.zeros(())
         metrics = dict.fromkeys(MEASURES, zero)
         info = {"road": road, "time_out": zero}
@@ -53,14 +54,14 @@ class BraxVehicle(Env):
         """Simulate one sampling period; keep other entries of `metrics` and `info`."""
         road = state.info["road"]
         moment, outcome = self.task.step(road, state.pipeline_state, action)  # pyright: ignore
-        ended, time_out = outcome.left | outcome.over, outcome.over.astype(float)
+        ended = outcome.left | outcome.over
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=moment,
             obs=self.task.observe(road, moment),
             reward=outcome.reward,
             done=ended.astype(float),
             metrics={**state.metrics, **outcome.measures},
-            info={**state.info, "time_out": time_out},
+            info={**state.info, "time_out": outcome.over.astype(float)},
         )
 
     def situation(self, state: BraxState) -> tuple[State, Environment, Reference]:
@@ -98,7 +99,12 @@ class BraxPlant(NamedTuple):
     The system has no pose in the plane: the first three entries of its state are 0.
 
     Attributes:
-        parameters: that the entries of e scale; 1 leaves the system unchanged.
+        dt: sampling period [s].
+        state_names: names of the entries of x.
+        control_low: lower limits of the controls.
+        control_high: upper limits of the controls.
+        parameters: the parameters that the entries of e scale; 1 leaves the system
+            unchanged.
         step: (x, u, e) -> x one sampling period later, u in the units of the motors.
         start: key -> x at the start of an episode of the environment.
     """
@@ -118,7 +124,12 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
     Args:
         env: from `brax.envs.get_environment(name, backend="generalized")`; wrappers are
             removed.
-        parameters: that the entries of e scale, of "gravity", "damping", "motor".
+        parameters: the parameters that the entries of e scale: some of "gravity",
+            "damping" and "motor".
+
+    Raises:
+        ValueError: the environment has no such system, or a parameter is unknown or
+            named twice.
     """
     inner = env.unwrapped
     if not isinstance(inner, PipelineEnv):
@@ -134,7 +145,8 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
             f"parameters must be different ones of {', '.join(SCALED)}, "
             f"got {parameters}"
         )
-    system, coordinates = inner.sys, inner.sys.q_size()
+    system = inner.sys
+    coordinates = system.q_size()
     # The environment acts once per several steps of the physics.
     frames = round(float(inner.dt) / float(system.opt.timestep))
 
@@ -148,28 +160,32 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
             }
         )
         q, qd = jnp.split(state[BODY], [coordinates])
-        moment, _ = jax.lax.scan(
-            lambda moment, _: (pipeline.step(changed, moment, control), None),
-            pipeline.init(changed, q, qd),
-            length=frames,
-        )
+
+        def frame(moment: Any, _: None) -> tuple[Any, None]:
+            return pipeline.step(changed, moment, control), None
+
+        moment = pipeline.init(changed, q, qd)
+        moment, _ = jax.lax.scan(frame, moment, length=frames)
         return _state(moment)
+
+    def start(key: Key) -> State:
+        return _state(inner.reset(key).pipeline_state)
 
     low, high = system.actuator.ctrl_range.T.tolist()
     # The pose stays first, where every model expects it.
-    names = [f"q_{k}" for k in range(coordinates)]
-    names += [f"qd_{k}" for k in range(system.qd_size())]
+    positions = [f"q_{k}" for k in range(coordinates)]
+    velocities = [f"qd_{k}" for k in range(system.qd_size())]
     return BraxPlant(
         dt=float(inner.dt),
-        state_names=("p_x", "p_y", "yaw", *names),
+        state_names=("p_x", "p_y", "yaw", *positions, *velocities),
         control_low=tuple(low),
         control_high=tuple(high),
         parameters=parameters,
         step=step,
-        start=lambda key: _state(inner.reset(key).pipeline_state),
+        start=start,
     )
 
 
 def _state(moment: Any) -> State:
-    """(0, 0, 0, q, q̇) of a state of brax."""
+    """Return (0, 0, 0, q, q̇) of a state of brax."""
     return jnp.concatenate([jnp.zeros(3), moment.q, moment.qd])

@@ -19,15 +19,20 @@ from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 from sfkd_jax.plants import Vehicle, dynamic, simulator
 from sfkd_jax.ranges import check_choice
 
-SLOWEST = 0.5  # m/s; the multi-body car divides by the speed over ground at every wheel
+SLOWEST = 0.5
+"""Lowest speed [m/s]: the multi-body car divides by the speed over ground at every
+wheel.
+"""
 ACCURACY: dict[str, Any] = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
 """An explicit method, although slip settles within I_w v / (R_w² K_x), 1 ms at 10 m/s:
 implicit steps fail at a locked wheel.
 """
 CARS = (1, 2, 3)
 """CommonRoad's numbers of the Ford Escort, the BMW 320i and the VW Vanagon."""
-STEERING_LAG, WIND_LEVER = 0.1, 0.4
-"""τ of the steering [s]; of the wind ahead of the centre of mass [m]."""
+STEERING_LAG = 0.1
+"""Time constant of the steering [s]."""
+WIND_LEVER = 0.4
+"""Distance at which the wind acts ahead of the centre of mass [m]."""
 OBSERVED = 7
 """Number of leading states, in the order of `plants.dynamic`."""
 
@@ -60,27 +65,51 @@ class Equations(NamedTuple):
     push: Callable[[Numbers, float, Car], dict[int, float]]
 
 
+def _std_velocity(x: Any) -> tuple[float, float]:
+    """Return (v, v_y) of the single track, whose state holds |v| and the slip angle."""
+    return x[3] * math.cos(x[6]), x[3] * math.sin(x[6])
+
+
+def _std_push(x: Any, force: float, car: Car) -> dict[int, float]:
+    """Return what a side force adds to the rates of the single track.
+
+    m d|v|/dt has F sin β, m |v| dβ/dt has F cos β.
+    """
+    return {
+        3: force / car.m * math.sin(x[6]),
+        6: force / (car.m * x[3]) * math.cos(x[6]),
+    }
+
+
+def _mb_velocity(x: Any) -> tuple[float, float]:
+    """Return (v, v_y) of the multi-body car."""
+    return x[3], x[10]
+
+
+def _mb_push(x: Any, force: float, car: Car) -> dict[int, float]:
+    """Return what a side force adds to the rates of the multi-body car.
+
+    It acts on the sprung mass; the axles follow through their joints.
+    """
+    return {10: force / car.m_s}
+
+
 MODELS = {
     "std": Equations(
-        vehicle_dynamics_std,
-        init_std,
-        lambda x: (x[3] * math.cos(x[6]), x[3] * math.sin(x[6])),
-        (7, 8),
-        (7, 8),
-        # m d|v|/dt has F sin β, m |v| dβ/dt has F cos β.
-        lambda x, force, car: {
-            3: force / car.m * math.sin(x[6]),
-            6: force / (car.m * x[3]) * math.cos(x[6]),
-        },
+        rates=vehicle_dynamics_std,
+        settled=init_std,
+        velocity=_std_velocity,
+        hidden=(7, 8),
+        wheels=(7, 8),
+        push=_std_push,
     ),
     "mb": Equations(
-        vehicle_dynamics_mb,
-        init_mb,
-        lambda x: (x[3], x[10]),
-        (*range(6, 10), *range(11, 29)),
-        (23, 24, 25, 26),
-        # On the sprung mass; the axles follow through their joints.
-        lambda x, force, car: {10: force / car.m_s},
+        rates=vehicle_dynamics_mb,
+        settled=init_mb,
+        velocity=_mb_velocity,
+        hidden=(*range(6, 10), *range(11, 29)),
+        wheels=(23, 24, 25, 26),
+        push=_mb_push,
     ),
 }
 
@@ -131,10 +160,13 @@ class _HostCar:
     """
 
     def __init__(self, model: str, car: int, dt: float, wind_force: float) -> None:
-        self.equations, self.dt, self.wind_force = MODELS[model], dt, wind_force
+        self.equations = MODELS[model]
+        self.dt = dt
+        self.wind_force = wind_force
         self.dry: Car = setup_vehicle_parameters(car)
         ours = dynamic()
-        self.control_low, self.control_high = ours.control_low, ours.control_high
+        self.control_low = ours.control_low
+        self.control_high = ours.control_high
         self.wheelbase = self.dry.a + self.dry.b
         hidden = (f"hidden_{index}" for index in self.equations.hidden)
         self.state_names = (*ours.state_names, *hidden)
@@ -145,7 +177,8 @@ class _HostCar:
 
     def flow(self, control: Numbers, env: Numbers) -> Callable[[Any], list[float]]:
         """Return x -> dx/dt in CommonRoad's coordinates."""
-        equations, tire = self.equations, self.dry.tire
+        equations = self.equations
+        tire = self.dry.tire
         # Friction limits the forces of the tyres, at the same stiffness.
         p_dx1 = tire.p_dx1 * env[0] / tire.p_dy1
         car = replace(self.dry, tire=replace(tire, p_dy1=env[0], p_dx1=p_dx1))
@@ -166,10 +199,14 @@ class _HostCar:
     def step(self, control: Numbers, env: Numbers) -> list[float]:
         """Return the state one sampling period later."""
         # In double precision: a wheel settles a hundred times faster than dt.
-        flow, velocity = self.flow(control, env), self.equations.velocity
+        flow = self.flow(control, env)
+
+        def rates(time: float, x: Any) -> list[float]:
+            return flow(x)
 
         def too_slow(time: float, x: Any) -> float:
-            return velocity(x)[0] - SLOWEST
+            forward, _ = self.equations.velocity(x)
+            return forward - SLOWEST
 
         too_slow.terminal = True  # type: ignore[attr-defined]
         ended = ValueError(f"the equations end at a forward speed of {SLOWEST} m/s")
@@ -178,7 +215,7 @@ class _HostCar:
         # The multi-body car divides by the speed of a wheel, which is held at 0 when it
         # rolls backwards: that is an ArithmeticError.
         solution = solve_ivp(
-            lambda time, x: flow(x),
+            rates,
             (0.0, self.dt),
             self.to_commonroad(self.state),
             events=too_slow,
@@ -207,9 +244,10 @@ class _HostCar:
         return [*seven, *(x[k] - settled[k] for k in self.equations.hidden)]
 
     def settled(self, state: Numbers) -> list[float]:
-        """CommonRoad's x of the first seven states, with all others at rest."""
+        """Return CommonRoad's x of the first seven states, with all others at rest."""
         x, y, yaw, along, across, yaw_rate, steering = state[:OBSERVED]
-        speed, slip = math.hypot(along, across), math.atan2(across, along)
+        speed = math.hypot(along, across)
+        slip = math.atan2(across, along)
         core = [x, y, steering, speed, yaw, yaw_rate, slip]
         # CommonRoad writes some of them as integers.
         return list(map(float, self.equations.settled(core, self.dry)))

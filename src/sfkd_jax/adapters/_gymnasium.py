@@ -14,7 +14,7 @@ from sfkd_jax.adapters._task import DrivingTask, LaneTask, Moment
 from sfkd_jax.scenarios import Scenario
 
 PROCESS = os.getpid()
-"""That imported this file, and started jax; a forked one inherits the number."""
+"""The process that imported this file and started jax; a forked one inherits this."""
 VIEW = 30.0
 """Half width of the view around the car [m]."""
 CORNERS = np.asarray([[1, 1], [1, -1], [-1, -1], [-1, 1]])
@@ -23,11 +23,14 @@ CORNERS = np.asarray([[1, 1], [1, -1], [-1, -1], [-1, 1]])
 
 def register_gymnasium() -> None:
     """Tell `gymnasium.make` of "sfkd_jax/Vehicle-v0" and "sfkd_jax/Lane-v0"."""
-    for kind in ("Vehicle", "Lane"):
+    entry_points = {
+        "sfkd_jax/Vehicle-v0": "sfkd_jax.adapters:GymnasiumVehicle",
+        "sfkd_jax/Lane-v0": "sfkd_jax.adapters:GymnasiumLane",
+    }
+    for name, entry_point in entry_points.items():
         # A second registration would warn.
-        if (name := f"sfkd_jax/{kind}-v0") not in gymnasium.registry:
-            entry = f"sfkd_jax.adapters:Gymnasium{kind}"
-            gymnasium.register(id=name, entry_point=entry)
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point=entry_point)
 
 
 class GymnasiumVehicle(gymnasium.Env):
@@ -45,18 +48,21 @@ class GymnasiumVehicle(gymnasium.Env):
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array, got {render_mode!r}")
-        task = self._task = self.task(**settings)
+        task = self.task(**settings)
+        self._task = task
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1 / task.plant.dt)}
-        spaces = jax.tree.map(gymnasium.spaces.Box, *task.observation_bounds)
-        named = isinstance(spaces, dict)
-        self.observation_space = gymnasium.spaces.Dict(spaces) if named else spaces
+        space = jax.tree.map(gymnasium.spaces.Box, *task.observation_bounds)
+        if isinstance(space, dict):
+            space = gymnasium.spaces.Dict(space)
+        self.observation_space = space
         self.action_space = gymnasium.spaces.Box(
             -1.0, 1.0, (task.action_size,), np.float32
         )
         self._now: tuple[Scenario, Moment] | None = None
         self._driven: list[np.ndarray] = []
-        self._start, self._advance = jax.jit(task.reset), jax.jit(task.step)
+        self._start = jax.jit(task.reset)
+        self._advance = jax.jit(task.step)
         self._observe = jax.jit(task.observe)
 
     def situation(self) -> tuple[Any, Any, Any]:
@@ -80,7 +86,8 @@ class GymnasiumVehicle(gymnasium.Env):
         super().reset(seed=seed, options=options)
         # gymnasium's generator decides, as its contract on seeds asks for.
         seed = int(self.np_random.integers(2**31))
-        road, moment = self._now = self._start(jax.random.key(seed))
+        road, moment = self._start(jax.random.key(seed))
+        self._now = (road, moment)
         self._driven = []
         return self._seen(road, moment), {}
 
@@ -93,7 +100,7 @@ class GymnasiumVehicle(gymnasium.Env):
             action = self.action(np.zeros(self._task.action_size))
         action = np.asarray(action, dtype=np.float32)
         moment, outcome = self._advance(road, moment, action)
-        self._now = road, moment
+        self._now = (road, moment)
         return (
             self._seen(road, moment),
             float(outcome.reward),
@@ -134,7 +141,7 @@ class GymnasiumLane(GymnasiumVehicle):
 def _image(
     task: DrivingTask, road: Scenario, moment: Moment, driven: list[Any]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Path, lane and driven line around the car."""
+    """Draw path, lane and driven line around the car."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
@@ -142,21 +149,28 @@ def _image(
     # Not of pyplot, which would keep every figure that is made.
     figure = Figure(figsize=(6.4, 4.8), dpi=100)
     axes = figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    points, state = np.asarray(road.path.points), np.asarray(moment.state)
-    normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
-    left, right = task.lane, task.lane
+    points = np.asarray(road.path.points)
+    state = np.asarray(moment.state)
+    left = task.lane
+    right = task.lane
     if road.course is not None:
         lane, obstacles = jax.tree.map(np.asarray, road.course[:2])
-        left, right = lane.left, lane.right
-        for place, _, half, radius, present in zip(*obstacles, strict=True):
-            axes.add_patch(Circle(place[0], present * (radius + np.hypot(*half))))
+        left = lane.left
+        right = lane.right
+        for position, _, half, radius, present in zip(*obstacles, strict=True):
+            # An obstacle that is not present is a circle of radius 0.
+            size = present * (radius + np.hypot(*half))
+            axes.add_patch(Circle(position[0], size))
+    normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
     for side, dashes in ((-right, "--"), (0.0, "-"), (left, "--")):
-        axes.plot(*(points[:, :2].T + side * normal), dashes, color="0.6", linewidth=1)
+        line = points[:, :2].T + side * normal
+        axes.plot(*line, dashes, color="0.6", linewidth=1)
     axes.plot(*np.stack(driven).T, color="C0", linewidth=1.5)
-    c, s = np.cos(state[2]), np.sin(state[2])
-    corners = CORNERS * task.plant.size.half
-    body = state[:2] + corners @ np.asarray([[c, s], [-s, c]])
-    axes.fill(*body.T, "C0", alpha=0.6)
+    cos = np.cos(state[2])
+    sin = np.sin(state[2])
+    turn = np.asarray([[cos, sin], [-sin, cos]])
+    corners = state[:2] + (CORNERS * task.plant.size.half) @ turn
+    axes.fill(*corners.T, "C0", alpha=0.6)
     axes.set_xlim(state[0] - VIEW, state[0] + VIEW)
     axes.set_ylim(state[1] - 0.75 * VIEW, state[1] + 0.75 * VIEW)
     axes.set_title(

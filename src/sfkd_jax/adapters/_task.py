@@ -29,17 +29,18 @@ from sfkd_jax.scenarios import (
 from sfkd_jax.types import BODY, POSE, Control, Environment, Key, Scalar, State
 
 MEASURES: tuple[str, ...] = ("lateral", "speed_error", "steering_rate")
+"""Names of what a step measures: |e_y| [m], |e_v| [m/s] and |δ̇| [rad/s]."""
 
 
 class Moment(NamedTuple):
     """The state of an episode.
 
     Attributes:
-        state: x.
-        progress: arc length reached [m].
+        state: state x of the car.
+        progress: arc length that the car has reached [m].
         lateral: signed distance from the path, left positive [m].
-        control: applied last, 0 at the start.
-        count: steps driven.
+        control: the control that was applied last, 0 at the start.
+        count: number of steps driven.
     """
 
     state: State
@@ -50,14 +51,14 @@ class Moment(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What one step earned, and whether it was the last.
+    """The reward of a step, and whether it was the last.
 
     Attributes:
         reward: −ℓ.
         left: whether the car left the lane, faces backwards, or its state is not
             finite.
         over: whether the road ended with the car on it.
-        measures: by the names of `MEASURES`: |e_y| [m], |e_v| [m/s], |δ̇| [rad/s].
+        measures: measures of the step by name, see `MEASURES`.
     """
 
     reward: Scalar
@@ -114,11 +115,12 @@ class DrivingTask:
         if not self.duration >= self.plant.dt:
             raise ValueError(f"duration must be at least a step, got {self.duration}")
         road = jax.eval_shape(self.family, jax.random.key(0))
-        given, wanted = road.initial_state.shape, (len(self.plant.state_names),)
-        if given != wanted:
+        shape = road.initial_state.shape
+        plant_shape = (len(self.plant.state_names),)
+        if shape != plant_shape:
             raise ValueError(
-                f"the scenario starts in a state of shape {given}, "
-                f"{self.plant.name!r} has {wanted}"
+                f"the scenario starts in a state of shape {shape}, "
+                f"{self.plant.name!r} has {plant_shape}"
             )
 
     @cached_property
@@ -135,10 +137,11 @@ class DrivingTask:
         """A key -> a road with its schedule of friction and wind."""
         if not isinstance(self.scenario, str):
             return self.scenario
-        named: Any = {"name": self.scenario}
+        settings: dict[str, Any] = {"name": self.scenario}
         if self.scenario == "obstacles":
-            named |= {"peak_curvature": 0.004, "wavelengths": (100.0, 300.0)}
-        return build.build_scenario(named, self.plant, duration=self.duration)
+            settings["peak_curvature"] = 0.004
+            settings["wavelengths"] = (100.0, 300.0)
+        return build.build_scenario(settings, self.plant, duration=self.duration)
 
     @property
     def action_size(self) -> int:
@@ -148,10 +151,14 @@ class DrivingTask:
     @property
     def observation_bounds(self) -> tuple[Any, Any]:
         """Smallest and largest observation."""
-        inf, body = math.inf, len(self.plant.state_names) - 3
+        inf = math.inf
         # Angles are wrapped and actions clipped; nothing else has a limit.
-        errors, points = [inf, math.pi], [inf, inf, math.pi, inf] * self.preview
-        high = [*errors, *[inf] * body, *[1.0] * self.action_size, inf, inf, *points]
+        errors = [inf, math.pi]
+        body = [inf] * (len(self.plant.state_names) - 3)
+        action = [1.0] * self.action_size
+        env = [inf, inf]
+        points = [inf, inf, math.pi, inf] * self.preview
+        high = [*errors, *body, *action, *env, *points]
         low = [-value for value in high]
         # Only friction is not symmetric about 0.
         low[-len(points) - 2] = 0.0
@@ -188,39 +195,40 @@ class DrivingTask:
         self, road: Scenario, moment: Moment, action: Control
     ) -> tuple[Moment, Transition]:
         """Simulate one sampling period with an action in [-1, 1]."""
-        plant, applied = self.plant, self.control(action)
+        plant = self.plant
+        applied = self.control(action)
         after = plant.step(moment.state, applied, _at(road.envs, moment))
         # The guess moves on with the car, so a path that crosses itself is no trap.
         guess = moment.progress + after[3] * plant.dt
         progress, offset = project(road.path, after[:2], guess)
         reached = Moment(after, progress, offset, applied, moment.count + 1)
         parts = [after, applied, jnp.stack([progress, offset])]
-        sound = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
         # A state that is not finite ends the episode; what is observed is the last one.
         kept: Moment = jax.tree.map(
-            lambda new, old: jnp.where(sound, new, old), reached, moment
+            lambda new, old: jnp.where(finite, new, old), reached, moment
         )
         # Facing backwards is leaving too: the other errors would not show it.
         backwards = jnp.abs(_heading(road, kept)) > 0.5 * jnp.pi
-        left = ~sound | self._outside(road, kept) | backwards
+        left = ~finite | self._outside(road, kept) | backwards
         # Time or road, whichever ends first.
-        over = kept.progress >= road.path.length
-        ended = (kept.count >= road.envs.shape[0]) | over
-        missed = kept.state[3] - road.speed
-        turned = (kept.control[0] - moment.control[0]) / plant.dt
+        road_ended = kept.progress >= road.path.length
+        ended = (kept.count >= road.envs.shape[0]) | road_ended
+        speed_error = kept.state[3] - road.speed
+        steering_rate = (kept.control[0] - moment.control[0]) / plant.dt
         cost = (
             self.lateral * kept.lateral**2
-            + self.speed * missed**2
-            + self.steering_rate * turned**2
+            + self.speed * speed_error**2
+            + self.steering_rate * steering_rate**2
         )
-        values = map(jnp.abs, (kept.lateral, missed, turned))
+        values = map(jnp.abs, (kept.lateral, speed_error, steering_rate))
         measures = dict(zip(MEASURES, values, strict=True))
         reward = -cost - self.leaving * left
         # Leaving at the last step is a failure, no end in time.
         return kept, Transition(reward, left, ~left & ended, measures)
 
     def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
-        """Whether the car has left the lane."""
+        """Return whether the car has left the lane."""
         return jnp.abs(moment.lateral) > self.lane
 
     def situation(self, road: Scenario, moment: Moment) -> tuple[State, Any, Any]:
@@ -279,6 +287,7 @@ class LaneTask(DrivingTask):
         return {name: -rows for name, rows in high.items()}, high
 
     def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
+        """Return whether the car touches an edge of the lane or an obstacle."""
         course = _course(road)
         size = self.plant.size
         side = moment.lateral * jnp.asarray([1.0, -1.0]) + 0.5 * size.width
@@ -295,40 +304,48 @@ class LaneTask(DrivingTask):
     def observe(self, road: Scenario, moment: Moment) -> Any:
         """Return the observation, as the class describes it."""
         state, env, (_, near) = self.situation(road, moment)
-        flat, points = super().observe(road, moment), 4 * self.preview
-        there = jnp.concatenate([near.position[:, 0], near.yaw[:, None]], axis=1)
-        there = jax.vmap(between, in_axes=(None, 0))(state[POSE], there)
-        rest = near.radius[:, None], near.present[:, None]
-        rows = jnp.concatenate([there, near.half, *rest], axis=1)
-        passed = road.speed * self.plant.dt * jnp.arange(1, self.preview + 1)
-        edges = _edges(_course(road), moment.progress + passed)
+        flat = super().observe(road, moment)
+        num_points = 4 * self.preview
+        poses = jnp.concatenate([near.position[:, 0], near.yaw[:, None]], axis=1)
+        poses = jax.vmap(between, in_axes=(None, 0))(state[POSE], poses)
+        columns = [poses, near.half, near.radius[:, None], near.present[:, None]]
+        rows = jnp.concatenate(columns, axis=1)
+        # Where the next points of the path are: one sampling period apart.
+        ahead = road.speed * self.plant.dt * jnp.arange(1, self.preview + 1)
+        edges = _edges(_course(road), moment.progress + ahead)
+        points = flat[-num_points:].reshape(-1, 4)
         return {
-            "observation": flat[: -points - len(env)],
+            "observation": flat[: -num_points - len(env)],
             "environment": env,
-            "lane": jnp.concatenate([flat[-points:].reshape(-1, 4), edges], axis=1),
+            "lane": jnp.concatenate([points, edges], axis=1),
             "obstacles": jnp.where(near.present[:, None], rows, 0.0),
         }
 
 
 def _course(road: Scenario) -> Course:
-    """The obstacles of a road."""
+    """Return the obstacles of a road."""
     if road.course is None:
         raise ValueError("a lane needs a scenario with obstacles, this one has none")
     return road.course
 
 
 def _edges(course: Course, s: Float[Array, "*shape"]) -> Array:
-    """Distances from the middle to the left and right edges at s [m], (…, 2)."""
-    left, right = course.lane.left, course.lane.right
-    at = course.lane.path.spacing * jnp.arange(left.shape[0])
-    return jnp.stack([jnp.interp(s, at, edge) for edge in (left, right)], axis=-1)
+    """Return the distances from the middle to the edges at arc lengths s [m], (…, 2).
+
+    The left edge comes first.
+    """
+    lane = course.lane
+    at = lane.path.spacing * jnp.arange(lane.left.shape[0])
+    left = jnp.interp(s, at, lane.left)
+    right = jnp.interp(s, at, lane.right)
+    return jnp.stack([left, right], axis=-1)
 
 
 def _at(envs: Float[Array, "time environment"], moment: Moment) -> Environment:
-    """e_k, the last one beyond the end of the schedule."""
+    """Return e at a step; beyond the end of the schedule it is the last one."""
     return envs[jnp.minimum(moment.count, envs.shape[0] - 1)]
 
 
 def _heading(road: Scenario, moment: Moment) -> Scalar:
-    """Yaw relative to the path [rad]."""
+    """Return the yaw relative to the path [rad]."""
     return wrap_angle(moment.state[2] - point_at(road.path, moment.progress)[2])

@@ -24,9 +24,7 @@ from sfkd_jax.control.planners._planner import Planner as Planner
 from sfkd_jax.control.planners._planner import SearchResult as SearchResult
 from sfkd_jax.control.planners._planner import tuned as tuned
 from sfkd_jax.control.tasks._along_path import along_reference as along_reference
-from sfkd_jax.control.tasks._along_path import behind as behind
 from sfkd_jax.control.tasks._along_path import following_law as following_law
-from sfkd_jax.control.tasks._along_path import requesting as requesting
 from sfkd_jax.control.tasks._path_tracking import Cost as Cost
 from sfkd_jax.control.tasks._path_tracking import StageInputs as StageInputs
 from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
@@ -40,6 +38,8 @@ from sfkd_jax.control.tasks._task import constrained as constrained
 from sfkd_jax.control.tasks._task import free_task as free_task
 from sfkd_jax.control.tasks._task import outside_boxes as outside_boxes
 from sfkd_jax.control.tasks._task import outside_circles as outside_circles
+from sfkd_jax.control.tasks._world_planner import behind as behind
+from sfkd_jax.control.tasks._world_planner import requesting as requesting
 from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
 from sfkd_jax.control.wrappers._conditions import Box as Box
 from sfkd_jax.control.wrappers._conditions import Conditions as Conditions

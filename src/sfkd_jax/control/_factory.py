@@ -1,4 +1,4 @@
-"""Dataclasses as controllers, and factories with their arguments, stated once."""
+"""Dataclasses as controllers, and factories that take the fields of a dataclass."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ class Stateful:
 
     def controller(self) -> Controller:
         """Return the controller, as two functions."""
-        own: Any = self
-        return Controller(own.init, own.act)
+        # A subclass defines both functions.
+        subclass: Any = self
+        return Controller(subclass.init, subclass.act)
 
 
 def factory(settings: Callable[P, S], make: Callable[[S], R]) -> Callable[P, R]:
-    """Return a function with the arguments of a dataclass, for editors and settings.
+    """Return a function with the arguments of a dataclass.
+
+    Editors and the settings of the commands read its signature.
 
     Args:
         settings: a dataclass, which checks its fields in `__post_init__`.

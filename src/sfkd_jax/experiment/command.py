@@ -26,8 +26,9 @@ from threadpoolctl import threadpool_limits
 from sfkd_jax import training
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.experiment.identified import with_identified
-from sfkd_jax.experiment.options import Settings, parse_settings, register
+from sfkd_jax.experiment.options import Settings, parse_settings
 from sfkd_jax.experiment.runs import IDENTITY
+from sfkd_jax.experiment.schemas import register
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, print_message
 

@@ -22,7 +22,7 @@ from sfkd_jax.settings import replace
 from sfkd_jax.training import TrainingStopped
 
 OF_A_ROW = (TrainingStopped, ValueError, store.ArtefactError, JaxRuntimeError)
-"""Errors that end a row, not the table; JAX raises one where memory does not suffice."""
+"""Errors that end a row and not the table; JAX raises its own if memory runs out."""
 NUM_STORED_EPISODES = 2
 """Episodes of a cell whose arrays are stored for figures; its row covers them all."""
 

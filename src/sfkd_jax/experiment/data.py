@@ -1,8 +1,7 @@
-"""The data set of a run and its law: loaded if they exist, made if they do not."""
+"""The data set of a run: loaded if it exists, simulated or read if it does not."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,65 +11,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, models, store
-from sfkd_jax.build import LoggedVehicleSettings
-from sfkd_jax.control import (
-    TEXTBOOK,
-    PathLaw,
-    derive_path_law,
-    law_from_arrays,
-    textbook_law,
-)
+from sfkd_jax import build, store
 from sfkd_jax.data import (
     PARTS,
     SCENARIOS,
     Dataset,
     check_on_path,
     environment_box,
-    fingerprint,
     generate,
     generate_along_path,
-    generate_open_loop,
     segment_scenarios,
     split,
 )
 from sfkd_jax.experiment import identified
+from sfkd_jax.experiment.dataset_files import dataset_config, dataset_path
+from sfkd_jax.experiment.laws import closed_loop, without_faults
 from sfkd_jax.experiment.options import LogSettings, Settings
-from sfkd_jax.plants import Vehicle, along_path, check_step
+from sfkd_jax.plants import check_step
 from sfkd_jax.settings import arguments
-from sfkd_jax.types import BODY, Key, Step, Trajectory
+from sfkd_jax.types import BODY, Key, Trajectory
 
-DATASET, LAW = "dataset", "law"
-SWITCHING, OPEN_LOOP, ALONE = 2, 3, 4
-"""Streams folded into the data set's seed; simulation and split use 0 and 1."""
-QUIET = (1e-6, 2e-6)
-"""Excitation of the law alone: none, but with a logarithm."""
-LOST = 1.0
-"""Largest lateral error that counts when laws are compared [m]."""
-STRAYS, SLACK = 1.5, 5.0
-"""A law is accepted up to this factor of what its model promises, and so many mm."""
-
-
-def config(settings: Settings) -> dict[str, Any]:
-    """Return what the data set of a run depends on; runs of equal values share it."""
-    dataset, environment = store.plain(settings.dataset), settings.environment
-    if logs := settings.logs:
-        # Contents instead of the path: the same logs elsewhere make the same data set.
-        del dataset["path"]
-        dataset["contents"] = fingerprint(logs.path)
-        dataset["environment_known"] = environment.is_known
-    box = {"low": environment.low, "high": environment.high}
-    vehicle = store.plain(settings.vehicle)
-    if isinstance(settings.vehicle, LoggedVehicleSettings):
-        # `contents` say what the vehicle is; where that lies is no matter.
-        del vehicle["path"], vehicle["identified"]
-    return store.plain({"vehicle": vehicle, "environment": box, "dataset": dataset})
-
-
-def dataset_path(settings: Settings) -> Path:
-    """Return the path of the data set of a run."""
-    name = f"{settings.vehicle.name}-{store.sha256(config(settings))[:8]}"
-    return Path(settings.root) / "datasets" / name / "dataset.safetensors"
+DATASET = "dataset"
+"""The kind of the file of a data set."""
+SWITCHING_STREAM = 2
+"""The stream of runs of S3, folded into the data set's seed. Simulation and split use 0
+and 1, laws use 3 and 4.
+"""
 
 
 def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
@@ -80,10 +46,12 @@ def ensure_dataset(settings: Settings) -> tuple[Dataset, str]:
         with store.locked(path.parent, wait=True):  # other runs share the data set
             # Another run may have made it while this one waited for the lock.
             if not path.is_file():
-                logs = settings.logs
-                made = _read_logs(settings, logs) if logs else _simulate(settings)
-                write(settings, made)
-    # Read back even if just made: every run trains on what is stored.
+                if logs := settings.logs:
+                    dataset = _read_logs(settings, logs)
+                else:
+                    dataset = _simulate(settings)
+                write(settings, dataset)
+    # Read back even if it is new: every run trains on what is stored.
     return read(settings)
 
 
@@ -92,14 +60,14 @@ def _simulate(settings: Settings) -> Dataset:
     environments = len(settings.environment.low or (0, 0))
     check_step(build.build_vehicle(settings.vehicle), environments)
     options: Any = settings.dataset
-    # A key each: other shares of the split leave the trajectories as they are.
+    # Two keys: other shares of the split leave the trajectories as they are.
     drive_key, split_key = jax.random.split(jax.random.key(options.seed))
     store.print_message(f"generating {options.segments} segments")
     trajectories = jax.jit(_generator(settings))(drive_key)
-    along = bool(settings.along_path)
-    labels = segment_scenarios(options.segments, along_path=along)
-    trajectories, labels = _without_faults(settings, trajectories, labels)
-    if along:
+    is_along_path = settings.along_path is not None
+    labels = segment_scenarios(options.segments, along_path=is_along_path)
+    trajectories, labels = without_faults(settings, trajectories, labels)
+    if is_along_path:
         check_on_path(trajectories)
     return split(
         trajectories,
@@ -110,33 +78,25 @@ def _simulate(settings: Settings) -> Dataset:
     )
 
 
-def _without_faults(settings: Settings, runs: Trajectory, *more: Any) -> Any:
-    """Drop the runs in which a simulator failed, and say how many they are."""
-    states = np.asarray(runs.states)
-    kept = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
-    lost = len(states) - len(kept)
-    # Of a function of jax it is a fault of the vehicle, which others report.
-    if not lost or not getattr(settings.vehicle, "env", None):
-        return runs, *more
-    failed = f"the simulator failed in {lost} of {len(states)} runs"
-    if not len(kept):
-        raise ValueError(f"{failed}; the warnings above say how")
-    store.print_message(f"{failed}, which are dropped")
-    return jax.tree.map(lambda leaf: leaf[kept], (runs, *more))
-
-
 def _generator(
     settings: Settings, *, switching: bool = False, **changes: int
 ) -> Callable[[Key], Trajectory]:
-    """Return key -> the runs of a data set, or as many under the switching of S3."""
-    changes["held_out"] = switching
+    """Return key -> the runs of a data set.
+
+    Args:
+        settings: of the run.
+        switching: whether the runs are under the switching of S3, which training never
+            uses.
+        changes: other arguments of the generator, in place of those of the settings.
+    """
+    changes = {**changes, "held_out": switching}
     box = settings.environment.box
     if settings.along_path:
-        options = settings.along_path.options | changes
-        return partial(generate_along_path, closed_loop(settings), **options, **box)
+        options = {**settings.along_path.options, **changes, **box}
+        return partial(generate_along_path, closed_loop(settings), **options)
     plant = build.build_vehicle(settings.vehicle)
-    options = arguments(settings.dataset, generate) | changes
-    return partial(generate, plant, build.build_driver(plant), **options, **box)
+    options = {**arguments(settings.dataset, generate), **changes, **box}
+    return partial(generate, plant, build.build_driver(plant), **options)
 
 
 def _read_logs(settings: Settings, logs: LogSettings) -> Dataset:
@@ -156,185 +116,71 @@ def write(settings: Settings, dataset: Dataset) -> None:
     if dataset.runs is not None:
         arrays["runs"] = [dataset.runs[part] for part in PARTS]
     if dataset.scenarios is not None:
-        arrays |= {f"{part}/scenario": dataset.scenarios[part] for part in PARTS}
-    about = config(settings)
-    store.write_arrays(dataset_path(settings), arrays, kind=DATASET, config=about)
+        for part in PARTS:
+            arrays[f"{part}/scenario"] = dataset.scenarios[part]
+    config = dataset_config(settings)
+    store.write_arrays(dataset_path(settings), arrays, kind=DATASET, config=config)
 
 
 def read(settings: Settings) -> tuple[Dataset, str]:
     """Return a data set and its hash."""
-    path, scenarios = dataset_path(settings), None
-    arrays, manifest = store.read_arrays(path, kind=DATASET, config=config(settings))
+    path = dataset_path(settings)
+    config = dataset_config(settings)
+    arrays, manifest = store.read_arrays(path, kind=DATASET, config=config)
 
-    def named(name: str) -> list[jax.Array]:
+    def of_all_parts(name: str) -> list[jax.Array]:
         return jax.device_put([arrays[f"{part}/{name}"] for part in PARTS])
 
+    scenarios = None
     with store.as_artefact_error(path):
-        fields = map(named, Trajectory._fields)
-        parts = [Trajectory(*own) for own in zip(*fields, strict=True)]
+        fields = map(of_all_parts, Trajectory._fields)
+        parts = [Trajectory(*leaves) for leaves in zip(*fields, strict=True)]
         if settings.logs is None:
-            scenarios = dict(zip(PARTS, named("scenario"), strict=True))
+            scenarios = dict(zip(PARTS, of_all_parts("scenario"), strict=True))
     # Over all parts: E does not depend on how they were split.
     envs = np.concatenate([np.asarray(part.envs) for part in parts])
-    known = settings.logs is None or settings.environment.is_known
-    box = settings.environment.box.values() if known else (None, None)
-    low, high = environment_box(envs, *box, known=known)
+    env_low, env_high = _environment_box(settings, envs)
     runs = None
-    if (counts := arrays.get("runs")) is not None:
+    counts = arrays.get("runs")
+    if counts is not None:
         runs = dict(zip(PARTS, map(int, counts), strict=True))
     dataset = Dataset(
-        *parts, env_low=low, env_high=high, runs=runs, scenarios=scenarios
+        *parts, env_low=env_low, env_high=env_high, runs=runs, scenarios=scenarios
     )
     return dataset, manifest["sha256"]
 
 
-def ensure_law(settings: Settings) -> PathLaw | None:
-    """Return the law of the data set, derived if it is missing; None in the world."""
-    if settings.along_path is None:
-        return None
-    path, about = dataset_path(settings).with_name("law.safetensors"), config(settings)
-    if not path.is_file():
-        law = jax.device_get(derive_law(settings))
-        store.write_arrays(path, law._asdict(), kind=LAW, config=about)
-    return law_from_arrays(store.read_arrays(path, kind=LAW, config=about)[0])
-
-
-def derive_law(settings: Settings) -> PathLaw:
-    """Derive the law of the data set from the model that its settings name.
-
-    Raises:
-        ValueError: the law of a learned model does not hold the vehicle on its paths.
-    """
-    along: Any = settings.along_path
-    plant = build.build_vehicle(settings.vehicle)
-    name, step = along.law.model, plant.step
-    if name in ("nominal", *TEXTBOOK):
-        step = plant.nominal
-    # A model of logs is a learned one already.
-    elif name == "learned" and not isinstance(settings.vehicle, LoggedVehicleSettings):
-        step = _learned_step(settings, plant)
-    store.print_message(
-        f"deriving the law of vehicle {plant.name} from its {name} model"
-    )
-    box = settings.environment.box
-    derive = partial(
-        derive_path_law,
-        step,
-        coordinates=len(plant.state_names) - 1,
-        **{corner: tuple(map(float, ends)) for corner, ends in box.items()},
-        **arguments(along.law, derive_path_law),
-    )
-    law = jax.jit(derive)()
-    if name in TEXTBOOK:
-        stray, about = _strays(settings, plant, plant.step), TEXTBOOK[name]
-        made = [textbook_law(law, name, k, wheelbase=plant.wheelbase) for k in about]
-        found = [stray(one) for one in made]
-        law = made[int(np.argmin(found))]
-        store.print_message(
-            f"the best of {len(made)} laws of {name} keeps vehicle {plant.name} within "
-            f"{min(found):.1f} mm (RMS) of its paths"
-        )
-    # Beside itself a model of logs would find nothing.
-    elif name != "plant" and step is not plant.step:
-        _check_law(settings, plant, law, step)
-    return law
-
-
-def _strays(
-    settings: Settings, plant: Vehicle, step: Step
-) -> Callable[[PathLaw], float]:
-    """Return law -> how far from its paths a step drives under it alone [mm, RMS]."""
-    quiet = dict.fromkeys(("steering_excitation", "speed_excitation"), QUIET)
-    along: Any = settings.along_path
-    options, excited = along.options | quiet, along.law.perturbation
-    options |= {"segments": 240, "steps": 100, **settings.environment.box}
-    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), ALONE)
-
-    @jax.jit
-    def drive(law: PathLaw) -> Trajectory:
-        loop = along_path(plant._replace(step=step), law, perturbation=excited)
-        return generate_along_path(loop, seed, **options)
-
-    def lateral(law: PathLaw) -> float:
-        (runs,) = _without_faults(settings, drive(law))
-        # A vehicle that leaves its path is lost, however far.
-        off = jnp.clip(runs.states[..., BODY.start], -LOST, LOST)
-        found = 1e3 * float(jnp.sqrt(jnp.mean(off**2)))
-        return found if np.isfinite(found) else np.inf
-
-    return lateral
-
-
-def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> None:
-    """Drive the vehicle by the law alone, beside the model that it was derived from.
-
-    Where the vehicle strays much farther than the model, the model is not that of the
-    vehicle: a learned one is refused, the textbook's is what was asked for.
-    """
-    found, promised = (_strays(settings, plant, one)(law) for one in (plant.step, step))
-    name = settings.along_path.law.model  # pyright: ignore
-    line = (
-        f"the law of the {name} model keeps vehicle {plant.name} within {found:.1f} mm "
-        f"(RMS) of its paths, the model promises {promised:.1f} mm"
-    )
-    # Not `>`: NaN is no law.
-    if not found <= STRAYS * promised + SLACK and name == "learned":
-        raise ValueError(
-            f"{line}: it was fitted badly; narrow dataset.law.speed or "
-            "dataset.law.lateral_acceleration, or pass dataset.law.model=plant"
-        )
-    store.print_message(line)
-
-
-def _learned_step(settings: Settings, plant: Vehicle) -> Step:
-    """The step of a regression of runs without a law, over the axes of the law."""
-    box = settings.environment.box
-    law: Any = settings.along_path and settings.along_path.law
-    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP)
-    run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
-    begun = time.perf_counter()
-    drive = partial(
-        generate_open_loop,
-        plant,
-        # A little beyond the axes, at whose ends steady turns are sought.
-        speed=(0.8 * law.speed[0], 1.1 * law.speed[1]),
-        lateral_acceleration=1.2 * law.lateral_acceleration,
-        **box,
-    )
-    (runs,) = _without_faults(settings, jax.jit(drive)(run_key))
-    dataset = split(runs, split_key, shares=(0.9, 0.05, 0.025, 0.025), **box)
-    model, _, params = identified.regression(dataset, start_key, fit_key)
-    store.print_message(
-        f"fitted a model of vehicle {plant.name} to {runs.controls.shape[0]} runs in "
-        f"{time.perf_counter() - begun:.0f} s"
-    )
-    return models.step_of(model, params)
-
-
-def closed_loop(settings: Settings) -> Vehicle:
-    """Return the closed loop of vehicle and law, in path coordinates."""
-    law: Any = ensure_law(settings)
-    return build.build_loop(build.build_vehicle(settings.vehicle), law)
+def _environment_box(settings: Settings, envs: np.ndarray) -> tuple[Any, Any]:
+    """Return the lower and the upper corner of E for the environments of a data set."""
+    if settings.logs is not None and not settings.environment.is_known:
+        return environment_box(envs, None, None, known=False)
+    environment = settings.environment
+    return environment_box(envs, environment.low, environment.high, known=True)
 
 
 def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
-    """Return the box of the measurements, as lower and upper corners.
+    """Return the boxes of body state, control and environment: [low, high] of each.
 
     Those of body state and control are hulls over training and calibration parts; that
     of the environment is E.
     """
-
-    def hull(*values: Any) -> list[list[float]]:
-        flat = np.concatenate([np.reshape(one, (-1, one.shape[-1])) for one in values])
-        return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
-
-    train, calibration = dataset.train, dataset.calibration
-    corners = dataset.env_low, dataset.env_high
+    train = dataset.train
+    calibration = dataset.calibration
     return {
-        "state": hull(train.states[..., BODY], calibration.states[..., BODY]),
-        "control": hull(train.controls, calibration.controls),
-        "env": [np.asarray(corner).tolist() for corner in corners],
+        "state": _hull(train.states[..., BODY], calibration.states[..., BODY]),
+        "control": _hull(train.controls, calibration.controls),
+        "env": [
+            np.asarray(dataset.env_low).tolist(),
+            np.asarray(dataset.env_high).tolist(),
+        ],
     }
+
+
+def _hull(*arrays: Any) -> list[list[float]]:
+    """Return the smallest and the largest value of each entry of the last axis."""
+    rows = [np.reshape(array, (-1, array.shape[-1])) for array in arrays]
+    flat = np.concatenate(rows)
+    return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
 
 
 def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory]:
@@ -346,20 +192,26 @@ def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory
     parts = {"test": dataset.test}
     if dataset.scenarios is None:
         return parts
-    key = dataset_path(settings), dataset.test.controls.shape[0]
-    if key not in _SWITCHING:
-        simulate = jax.jit(_generator(settings, switching=True, segments=key[1]))
-        seed = jax.random.key(settings.dataset.seed)
-        # A stream of its own: S3 must not repeat what the training data drew.
-        runs = simulate(jax.random.fold_in(seed, SWITCHING))
-        (_SWITCHING[key],) = _without_faults(settings, runs)
-    parts["s3"] = _SWITCHING[key]
+    parts["s3"] = _switching_runs(settings, dataset.test.controls.shape[0])
     for code, name in enumerate(SCENARIOS):
-        if (chosen := dataset.scenarios["test"] == code).any():
+        chosen = dataset.scenarios["test"] == code
+        if chosen.any():
             parts[name] = jax.tree.map(
                 lambda leaf, chosen=chosen: leaf[chosen], dataset.test
             )
     return parts
+
+
+def _switching_runs(settings: Settings, count: int) -> Trajectory:
+    """Return so many runs under the switching of S3; they are simulated once."""
+    key = (dataset_path(settings), count)
+    if key not in _SWITCHING:
+        simulate = jax.jit(_generator(settings, switching=True, segments=count))
+        seed = jax.random.key(settings.dataset.seed)
+        # A stream of its own: S3 must not repeat what the training data drew.
+        runs = simulate(jax.random.fold_in(seed, SWITCHING_STREAM))
+        (_SWITCHING[key],) = without_faults(settings, runs)
+    return _SWITCHING[key]
 
 
 _SWITCHING: dict[tuple[Path, int], Trajectory] = {}

@@ -18,7 +18,7 @@ from jaxtyping import Array
 from sfkd_jax import build, evaluation, policy, store
 from sfkd_jax.build import System
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import data, runs, stages
+from sfkd_jax.experiment import data, laws, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, on_host, unfold
@@ -30,7 +30,10 @@ from sfkd_jax.types import Controller, Key, Params
 class EpisodeSet(NamedTuple):
     """Paired episodes of a scenario that every system is evaluated on.
 
-    Scenarios and keys, of sensors and samplers, have one entry per episode.
+    Attributes:
+        name: of the scenario.
+        scenarios: roads and environments, with one entry per episode.
+        keys: of sensors and samplers, one per episode.
     """
 
     name: str
@@ -39,7 +42,12 @@ class EpisodeSet(NamedTuple):
 
 
 class SystemResult(NamedTuple):
-    """A row of results.json before comparisons, and the arrays behind it."""
+    """What the evaluation of a system on a set of episodes gives.
+
+    Attributes:
+        row: its row of results.json, not yet compared with others.
+        arrays: the recorded episodes, by name.
+    """
 
     row: Row
     arrays: dict[str, np.ndarray]
@@ -47,10 +55,13 @@ class SystemResult(NamedTuple):
 
 def make_episodes(settings: Settings) -> EpisodeSet:
     """Draw the episodes of a scenario."""
-    plant, protocol = build.build_vehicle(settings.vehicle), settings.evaluation
+    plant = build.build_vehicle(settings.vehicle)
+    protocol = settings.evaluation
     check_step(plant, len(settings.environment.low or (0, 0)))
-    about: Any = {"duration": protocol.episode_s} | settings.environment.box
-    family = build.build_scenario(settings.scenario, plant, **about)
+    box: Any = settings.environment.box
+    family = build.build_scenario(
+        settings.scenario, plant, duration=protocol.episode_s, **box
+    )
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
     @jax.jit
@@ -61,10 +72,11 @@ def make_episodes(settings: Settings) -> EpisodeSet:
         return scenarios._replace(observed_envs=observed)
 
     # Two streams: other settings of the sensors leave the roads as they are.
-    keys = jax.vmap(partial(jax.random.split, num=protocol.episodes))(
-        jax.random.split(jax.random.key(protocol.seed))
-    )
-    return EpisodeSet(settings.scenario.name, draw(keys[0], keys[1]), keys[1])
+    streams = jax.random.split(jax.random.key(protocol.seed))
+    per_episode = partial(jax.random.split, num=protocol.episodes)
+    road_keys, sensor_keys = jax.vmap(per_episode)(streams)
+    scenarios = draw(road_keys, sensor_keys)
+    return EpisodeSet(settings.scenario.name, scenarios, sensor_keys)
 
 
 def _over_episodes(
@@ -78,30 +90,38 @@ def _over_episodes(
     # Weights are arguments: of constants every training would be compiled anew.
     if jax.default_backend() != "cpu":
         return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))
-    compiled, cores = jax.jit(run), os.cpu_count() or 1
-    # A process may be kept to some cores, as each of a comparison is.
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
+    compiled = jax.jit(run)
+    cores = _available_cores()
 
     def run_all(params: Params, scenarios: Scenario, keys: Array) -> evaluation.Episode:
         count = len(keys)
-        batch = [
+        inputs = [
             (params, *jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys)))
             for i in range(count)
         ]
         # Ahead of the threads, which would compile the same program side by side.
-        program = compiled.lower(*batch[0]).compile()
+        program = compiled.lower(*inputs[0]).compile()
+
+        def run_one(inputs_of_one: tuple[Any, ...]) -> evaluation.Episode:
+            return jax.block_until_ready(program(*inputs_of_one))
+
         pool = ThreadPoolExecutor(min(count, cores))
         try:
-            done = list(
-                pool.map(lambda one: jax.block_until_ready(program(*one)), batch)
-            )
+            episodes = list(pool.map(run_one, inputs))
         finally:
             # Nobody waits for the episodes of an interrupted command.
             pool.shutdown(wait=False, cancel_futures=True)
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *done)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
 
     return run_all
+
+
+def _available_cores() -> int:
+    """Return how many cores this process may use."""
+    # A process may be kept to some cores, as each of a comparison is.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def load_systems(settings: Settings) -> dict[str, System]:
@@ -112,7 +132,7 @@ def load_systems(settings: Settings) -> dict[str, System]:
     `environment.source=estimated` every system that reads e estimates it.
     """
     plant = build.build_vehicle(settings.vehicle)
-    references = build.reference_systems(plant, data.ensure_law(settings))
+    references = build.reference_systems(plant, laws.ensure_law(settings))
     systems = {}
     for name in settings.evaluation.systems:
         if name == "oracle" and getattr(settings.vehicle, "env", None):
@@ -121,15 +141,27 @@ def load_systems(settings: Settings) -> dict[str, System]:
         if name == "self":
             systems[settings.model.system] = _policy_system(settings)
             continue
-        if (along := settings.along_path) and (whose := build.LAWS_ALONE.get(name)):
-            along = replace(along, law=replace(along.law, model=whose))
-            law = data.ensure_law(replace(settings, dataset=along))
-            references[name] = build.reference_systems(plant, law)["law"]
+        if settings.along_path and name in build.LAWS_ALONE:
+            references[name] = _law_alone(settings, plant, build.LAWS_ALONE[name])
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
             system = system._replace(env_source="estimated")
         systems[name] = system
     return systems
+
+
+def _law_alone(settings: Settings, plant: Vehicle, law_model: str) -> System:
+    """Return the system "law" with the law that is derived from another model.
+
+    Args:
+        settings: of the run, along a path.
+        plant: its vehicle.
+        law_model: the model, one of `build.LAW_MODELS`.
+    """
+    along: Any = settings.along_path
+    dataset = replace(along, law=replace(along.law, model=law_model))
+    law = laws.ensure_law(replace(settings, dataset=dataset))
+    return build.reference_systems(plant, law)["law"]
 
 
 def _policy_system(settings: Settings) -> System:
@@ -149,13 +181,14 @@ class SystemEvaluation:
 
     def __init__(self, settings: Settings, name: str, system: System) -> None:
         """Build the controller."""
+        plant = build.build_vehicle(settings.vehicle)
         self._settings = settings
-        self._plant = plant = build.build_vehicle(settings.vehicle)
+        self._plant = plant
         box: Any = settings.environment.box
         if settings.logs:
-            # Measured: their settings have none.
+            # The settings of logs state no box of e: it is measured.
             dataset, _ = data.ensure_dataset(settings)
-            box = dict(zip(box, (dataset.env_low, dataset.env_high), strict=True))
+            box = {"env_low": dataset.env_low, "env_high": dataset.env_high}
         self.controller = build.build_controller(
             settings.controller,
             system.model,
@@ -184,40 +217,49 @@ class SystemEvaluation:
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores = self._scored(episodes, 0.0)
-        row = evaluation.row(scores, self._columns | {"scenario": episodes.name})
-        if forces := self._settings.evaluation.side_forces:
+        row = evaluation.row(scores, {**self._columns, "scenario": episodes.name})
+        forces = self._settings.evaluation.side_forces
+        if forces:
             row["disturbed"] = []
         for force in forces:
             # Without a force the episodes are those above, and not simulated again.
             if force:
                 _, scores = self._scored(episodes, force)
             row["disturbed"].append(evaluation.disturbed(force, scores))
-        parts = ("lateral", "states", "controls")
-        arrays = {part: getattr(episode, part) for part in parts}
-        # With the roads: a page draws them without the settings.
-        known = episodes.scenarios
-        arrays |= {"envs": known.envs, "path": known.path.points, "dt": self._plant.dt}
+        arrays = {
+            "lateral": episode.lateral,
+            "states": episode.states,
+            "controls": episode.controls,
+            # With the roads: a page draws them without the settings.
+            "envs": episodes.scenarios.envs,
+            "path": episodes.scenarios.path.points,
+            "dt": self._plant.dt,
+        }
         return SystemResult(row, jax.tree.map(np.asarray, arrays))
 
     def _scored(
         self, episodes: EpisodeSet, force: float
     ) -> tuple[evaluation.Episode, evaluation.Scores]:
-        """Episodes under unmeasured side forces up to `force` [N], and their scores."""
-        known = driven = episodes.scenarios
+        """Simulate episodes under unmeasured side forces, and score them.
+
+        Args:
+            episodes: to simulate.
+            force: largest side force [N]; 0 for none.
+        """
+        scenarios = episodes.scenarios
         if force:
             disturb = partial(
                 evaluation.disturbed_environment, self._plant, largest=force
             )
-            envs = jax.jit(jax.vmap(disturb))(known.envs, episodes.keys)
-            driven = known._replace(envs=envs)
-        episode = self._simulate(self.params, driven, episodes.keys)
-        return episode, evaluation.score(
-            episode, dt=self._plant.dt, size=self._plant.size
-        )
+            envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
+            scenarios = scenarios._replace(envs=envs)
+        episode = self._simulate(self.params, scenarios, episodes.keys)
+        scores = evaluation.score(episode, dt=self._plant.dt, size=self._plant.size)
+        return episode, scores
 
 
 def has_course(settings: Settings) -> bool:
-    """Whether there are obstacles on the road, and scenes in place of references."""
+    """Return whether there are obstacles on the road, and scenes, not references."""
     return settings.scenario.name in COURSES
 
 
@@ -243,8 +285,9 @@ def _in_lane(
 
 
 def _columns(settings: Settings, name: str, system: System) -> Row:
-    """The columns of a row that do not depend on episodes."""
-    protocol, certificate = settings.evaluation, system.certificate
+    """Return the columns of a row that do not depend on episodes."""
+    protocol = settings.evaluation
+    certificate = system.certificate
     leaves = jax.tree.leaves(unfold(system.params))
     return {
         "system": name,
@@ -266,44 +309,66 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
 def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     """Evaluate every system of `evaluation.systems` and add its rows to the results.
 
-    Rows of other scenarios and controllers in the same run stay. `command`, as it was
-    typed, is stored with the results. Returns the path of results.json.
+    Rows of other scenarios and controllers in the same run stay.
+
+    Args:
+        settings: of the run.
+        command: the command as it was typed, which is stored with the results.
+
+    Returns:
+        The path of results.json.
     """
     began = time.perf_counter()
     # Vehicle and earlier results are checked before anything is trained.
     episodes = make_episodes(settings)
     runs.read_results(settings.run_dir)
-    compared = load_systems(settings)
-    config = store.plain(settings) | ({"command": command} if command else {})
+    systems = load_systems(settings)
+    config = store.plain(settings)
+    if command:
+        config["command"] = command
 
-    def keep(found: list[SystemResult]) -> Path:
+    def keep(results: list[SystemResult]) -> Path:
         seconds = time.perf_counter() - began
-        return runs.write_results(settings.run_dir, config, found, seconds)
+        return runs.write_results(settings.run_dir, config, results, seconds)
 
-    return keep(drive(settings, compared, episodes, keep))
+    return keep(drive(settings, systems, episodes, keep))
+
+
+def _keep_nothing(results: list[SystemResult]) -> None:
+    """Keep no result before all systems are done."""
 
 
 def drive(
     settings: Settings,
     systems: Mapping[str, System],
     episodes: EpisodeSet,
-    keep: Callable[[list[SystemResult]], Any] = lambda found: None,
+    keep: Callable[[list[SystemResult]], Any] = _keep_nothing,
 ) -> list[SystemResult]:
     """Simulate, score and compare systems on the same episodes, with messages.
 
-    `keep` receives each system as it is done: a command that is stopped loses no other.
+    Args:
+        settings: of the run.
+        systems: by name.
+        episodes: that all of them drive.
+        keep: receives the result of each system when it is done, so that a command that
+            is stopped loses the results of no other system.
     """
-    protocol, found = settings.evaluation, list[SystemResult]()
+    protocol = settings.evaluation
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
     if has_course(settings):
-        # Only a corridor keeps a car clear of what it passes: the others stay at home.
-        systems = {n: one for n, one in systems.items() if one.certificate} or systems
+        # Only a corridor keeps a car clear of what it passes: the others are left out.
+        certified = {
+            name: system for name, system in systems.items() if system.certificate
+        }
+        systems = certified or systems
+    results: list[SystemResult] = []
     for name, system in systems.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
         result = SystemEvaluation(settings, name, system)(episodes)
-        found.append(result)
+        results.append(result)
         keep([result])
-        error, worst = result.row["rmse_m"]["mean"], result.row["max_deviation_m"]
+        error = result.row["rmse_m"]["mean"]
+        worst = result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
-    evaluation.compare([result.row for result in found])
-    return found
+    evaluation.compare([result.row for result in results])
+    return results

@@ -29,12 +29,14 @@ from sfkd_jax.settings import arguments, replace
 from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import Key, Model, Params, Step
 
-REGRESSION = 16_000
+REGRESSION_STEPS = 16_000
 """Optimiser steps of the model that a law is derived from."""
 STEEPEST = ("peak_curvature", "lateral_acceleration", "acceleration")
-"""Settings of drives that end where the logs of a vehicle do."""
-LIMITS, HEADROOM = ("control_low", "control_high"), 1.5
-"""Of the actuators: if they are not given, this many times as wide as in the logs."""
+"""Settings of drives that are reduced to what the logs of a vehicle reach."""
+LIMITS = ("control_low", "control_high")
+"""Settings of a vehicle that hold the limits of its actuators."""
+HEADROOM = 1.5
+"""Limits that no setting states are so many times as wide as the controls in logs."""
 HORIZON = 20
 """Steps ahead at which models are compared."""
 
@@ -55,7 +57,9 @@ def read(
         )
     store.print_message(f"reading {logs.path}")
     options: Any = arguments(logs, from_logs)
-    options |= {"dt": plant.dt, "wheelbase": plant.wheelbase}
+    # These are settings of the vehicle, not of its logs.
+    options["dt"] = plant.dt
+    options["wheelbase"] = plant.wheelbase
     return from_logs(
         str(logs.path),
         columns,
@@ -73,54 +77,99 @@ def with_identified(settings: Settings) -> Settings:
     Its limits, the box of e and the class of drives become those that the logs reach:
     beyond them a model extrapolates. Other settings are returned as they are.
     """
-    vehicle, environment = settings.vehicle, settings.environment
+    vehicle = settings.vehicle
+    environment = settings.environment
     if not isinstance(vehicle, LoggedVehicleSettings):
         return settings
     if vehicle.path is None:
         raise ValueError("vehicle=logged needs vehicle.path=FOLDER, where its logs are")
     vehicle = replace(vehicle, contents=fingerprint(vehicle.path))
-    about = store.plain({"vehicle": vehicle, "environment": environment.box})
-    del about["vehicle"]["path"]
-    about["environment_known"] = environment.is_known
-    names = vehicle.columns.environment if environment.is_known else ()
-    folder = f"logged-{store.sha256(about)[:8]}"
-    path = Path(settings.root) / "vehicles" / folder / "vehicle.safetensors"
-    with store.locked(path.parent, wait=True):  # other runs share the vehicle
-        if not path.is_file():
-            logged = read(vehicle, environment, vehicle).dataset
-            low, high = map(np.asarray, (logged.env_low, logged.env_high))
-            if not names:  # nothing depends on what nobody measured
-                low, high = -np.ones_like(low), np.ones_like(high)
-            if (still := low == high).any():
-                raise ValueError(
-                    f"{names[int(still.argmax())]} is always the same in the logs: "
-                    "leave it out of vehicle.columns.environment"
-                )
-            arrays = _identify(logged, vehicle.dt)
-            arrays |= {"env_low": low, "env_high": high}
-            store.write_arrays(path, arrays, kind=build.IDENTIFIED, config=about)
-    arrays, _ = store.read_arrays(path, kind=build.IDENTIFIED, config=about)
+    path, arrays = _ensure_identified(settings, vehicle)
     reached = {name: np.asarray(value).tolist() for name, value in arrays.items()}
     limits = {name: getattr(vehicle, name) or reached[name] for name in LIMITS}
     scenario: Any = settings.scenario
-    box = {"low": reached["env_low"], "high": reached["env_high"]}
-    box |= {"names": environment.names or names}
     slowest, fastest = reached["speed"]
     return replace(
         settings,
         vehicle=replace(vehicle, identified=str(path), **limits),
-        environment=replace(environment, **box),
+        environment=replace(
+            environment,
+            low=reached["env_low"],
+            high=reached["env_high"],
+            names=environment.names or _env_columns(settings, vehicle),
+        ),
         scenario=replace(scenario, speed=min(max(scenario.speed, slowest), fastest)),
         dataset=_within(settings.dataset, reached),
     )
+
+
+def _env_columns(settings: Settings, vehicle: LoggedVehicleSettings) -> tuple[str, ...]:
+    """Return the columns of the logs that hold e; none if nobody measured it."""
+    if settings.environment.is_known:
+        return vehicle.columns.environment
+    return ()
+
+
+def _ensure_identified(
+    settings: Settings, vehicle: LoggedVehicleSettings
+) -> tuple[Path, dict[str, np.ndarray]]:
+    """Return the file of the model of a vehicle, and its arrays; fit it if missing.
+
+    Args:
+        settings: of the run.
+        vehicle: with the hash of its logs in `contents`.
+    """
+    environment = settings.environment
+    config = store.plain({"vehicle": vehicle, "environment": environment.box})
+    # Contents instead of the path: the same logs elsewhere make the same model.
+    del config["vehicle"]["path"]
+    config["environment_known"] = environment.is_known
+    folder = f"logged-{store.sha256(config)[:8]}"
+    path = Path(settings.root) / "vehicles" / folder / "vehicle.safetensors"
+    with store.locked(path.parent, wait=True):  # other runs share the vehicle
+        if not path.is_file():
+            logged = read(vehicle, environment, vehicle).dataset
+            env_low, env_high = _logged_env_box(logged, _env_columns(settings, vehicle))
+            arrays = _identify(logged, vehicle.dt)
+            arrays["env_low"] = env_low
+            arrays["env_high"] = env_high
+            store.write_arrays(path, arrays, kind=build.IDENTIFIED, config=config)
+    arrays, _ = store.read_arrays(path, kind=build.IDENTIFIED, config=config)
+    return path, arrays
+
+
+def _logged_env_box(
+    logged: Dataset, names: tuple[str, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box of e in logs.
+
+    Args:
+        logged: the data set of the logs.
+        names: of the entries of e; () if nobody measured it.
+
+    Raises:
+        ValueError: an entry of e never changes.
+    """
+    low = np.asarray(logged.env_low)
+    high = np.asarray(logged.env_high)
+    if not names:  # nothing depends on what nobody measured
+        return -np.ones_like(low), np.ones_like(high)
+    constant = low == high
+    if constant.any():
+        raise ValueError(
+            f"{names[int(constant.argmax())]} is always the same in the logs: "
+            "leave it out of vehicle.columns.environment"
+        )
+    return low, high
 
 
 def _within(drives: Any, reached: dict[str, Any]) -> Any:
     """Return settings of drives, and of a law for them, that stay inside of logs."""
     if not hasattr(drives, "speed"):
         return drives
-    (low, high), (slowest, fastest) = drives.speed, reached["speed"]
-    speed = max(low, slowest), min(high, fastest)
+    low, high = drives.speed
+    slowest, fastest = reached["speed"]
+    speed = (max(low, slowest), min(high, fastest))
     if not speed[0] < speed[1]:
         raise ValueError(
             f"dataset.speed is {low:g} to {high:g} m/s, "
@@ -138,69 +187,90 @@ def _within(drives: Any, reached: dict[str, Any]) -> Any:
 def _identify(dataset: Dataset, dt: float) -> dict[str, Any]:
     """Fit a model of one step to logs; return its arrays, and what the logs reach."""
     began = time.perf_counter()
-    model, start, fitted = regression(dataset, *jax.random.split(jax.random.key(0)))
-    found = {"least squares": _linear(start), "regression": fitted}
+    start_key, fit_key = jax.random.split(jax.random.key(0))
+    model, start, fitted = regression(dataset, start_key, fit_key)
+    candidates = {"least squares": _linear(start), "regression": fitted}
     horizon = min(HORIZON, dataset.validation.controls.shape[1])
 
     def error(params: Params) -> float:
-        """Root mean square error of the position after the horizon [m]."""
-        ahead = open_loop(model, params, dataset.validation, horizon=horizon)
-        return float(jnp.nan_to_num(jnp.hypot(*ahead[-1, :2]), nan=jnp.inf))
+        """Return the RMS error of the position after the horizon [m]."""
+        errors = open_loop(model, params, dataset.validation, horizon=horizon)
+        position = jnp.hypot(*errors[-1, :2])
+        return float(jnp.nan_to_num(position, nan=jnp.inf))
 
-    errors = {name: error(params) for name, params in found.items()}
-    best = min(errors, key=lambda name: errors[name])
-    told = ", ".join(f"{value:.3g} m by {name}" for name, value in errors.items())
+    errors = {name: error(params) for name, params in candidates.items()}
+    best = min(errors, key=errors.__getitem__)
+    listed = ", ".join(f"{value:.3g} m by {name}" for name, value in errors.items())
     store.print_message(
         f"fitted a model to the logs in {time.perf_counter() - began:.0f} s; position "
-        f"error {horizon * dt:.2g} s ahead on validation: {told}; it is the {best}"
+        f"error {horizon * dt:.2g} s ahead on validation: {listed}; it is the {best}"
     )
     parts = [getattr(dataset, part) for part in PARTS]
-    states, controls, _ = map(np.concatenate, zip(*parts, strict=True))
+    states = np.concatenate([part.states for part in parts])
+    controls = np.concatenate([part.controls for part in parts])
     # A law steers more than a driver: at the ends of the logs it would stop short.
-    low, high = controls.min(axis=(0, 1)), controls.max(axis=(0, 1))
-    more = 0.5 * (HEADROOM - 1.0) * (high - low)
-    fitted = {"space": measure_space(dataset)._asdict(), "params": found[best]}
-    limits = dict(zip(LIMITS, (low - more, high + more), strict=True))
-    return limits | _drives(states, dt) | models.flat(fitted)
+    low = controls.min(axis=(0, 1))
+    high = controls.max(axis=(0, 1))
+    headroom = 0.5 * (HEADROOM - 1.0) * (high - low)
+    of_model = {"space": measure_space(dataset)._asdict(), "params": candidates[best]}
+    return {
+        "control_low": low - headroom,
+        "control_high": high + headroom,
+        **_reached(states, dt),
+        **models.flat(of_model),
+    }
 
 
-def _drives(states: np.ndarray, dt: float) -> dict[str, Any]:
-    """Range of the speed, and the largest of `STEEPEST`, without outliers."""
-    speed, lag = states[..., 3], min(5, states.shape[1] - 1)
+def _reached(states: np.ndarray, dt: float) -> dict[str, Any]:
+    """Return the range of the speed, and the largest of `STEEPEST`, without outliers.
+
+    Args:
+        states: (run, time, state).
+        dt: sampling period [s].
+    """
+    speed = states[..., 3]
     # Over half a second: the noise of a sensor is no turn.
+    lag = min(5, states.shape[1] - 1)
     rates = (states[:, lag:, 2:4] - states[:, :-lag, 2:4]) / (lag * dt)
-    turn, push = np.abs(np.moveaxis(rates, -1, 0))
+    yaw_rate, acceleration = np.abs(np.moveaxis(rates, -1, 0))
     moving = np.maximum(np.abs(speed[:, lag:]), 1.0)
-    steepest = turn / moving, turn * moving, push
-    largest = (np.quantile(values, 0.998) for values in steepest)
     return {
         "speed": np.quantile(speed, [0.001, 0.999]),
-        **dict(zip(STEEPEST, largest, strict=True)),
+        "peak_curvature": np.quantile(yaw_rate / moving, 0.998),
+        "lateral_acceleration": np.quantile(yaw_rate * moving, 0.998),
+        "acceleration": np.quantile(acceleration, 0.998),
     }
 
 
 def regression(
     dataset: Dataset, start_key: Key, fit_key: Key
 ) -> tuple[Model, Params, Params]:
-    """The model of one step, its parameters before any training, and after it."""
+    """Return a model of one step, its parameters before training, and after it."""
     model, start = _one_step(dataset, start_key)
-    loss, draw = one_step_loss(model), partial(random_windows, batch=512, length=1)
-    fitted = descend(start, loss, draw, dataset.train, fit_key, steps=REGRESSION)
+    fitted = descend(
+        start,
+        one_step_loss(model),
+        partial(random_windows, batch=512, length=1),
+        dataset.train,
+        fit_key,
+        steps=REGRESSION_STEPS,
+    )
     return model, start, fitted
 
 
 def least_squares(dataset: Dataset) -> Step:
-    """Return the best linear model of one step, of the training part of a data set."""
+    """Return the step of the best linear model of the training part of a data set."""
     model, params = _one_step(dataset, jax.random.key(0))
     return models.step_of(model, _linear(params))
 
 
 def _linear(params: Params) -> Params:
-    """The linear part alone: without a scale the network has no say."""
-    return params | {"scale": 0.0 * params["scale"]}
+    """Return the parameters without the network, whose output is scaled by 0."""
+    return {**params, "scale": 0.0 * params["scale"]}
 
 
 def _one_step(dataset: Dataset, key: Key) -> tuple[Model, Params]:
+    """Return a model of one step with its parameters by least squares."""
     model = models.one_step(measure_space(dataset))
     identify: Any = model.fitting.identify
     return model, jax.jit(identify)(dataset.train, dataset.validation, key)

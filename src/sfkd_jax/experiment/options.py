@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import field, is_dataclass
+from dataclasses import field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
-
-from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig, OmegaConf
+from typing import Annotated, Any
 
 from sfkd_jax import build, data, evaluation, export, training
 from sfkd_jax.build import (
@@ -39,9 +35,11 @@ from sfkd_jax.settings import OneOf, Values, arguments, parse, replace, schema, 
 
 Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
-"""Of an episode; the first two seconds are not scored."""
+"""The length of an episode, whose first two seconds are not scored."""
 empty: Any = partial(field, default_factory=dict)
+"""Declares a field that is an empty dictionary by default."""
 _BOX = ("env_low", "env_high")
+"""Arguments of factories that the settings of the environment decide."""
 
 
 @takes(sensor=schema("Sensor", object, evaluation.observed_environment, skip=("dt",)))
@@ -49,11 +47,11 @@ class EnvironmentSettings:
     """What surrounds the vehicle: e in its box, and how a controller learns of it.
 
     Attributes:
+        sensor: delay, noise and bias of a measured e.
         low: lower corner of the box E; None for that of recorded logs.
         high: upper corner of E.
-        names: of the entries of e, with units; () for friction and lateral wind.
+        names: names of the entries of e, with units; () for friction and lateral wind.
         source: "measured", "estimated" while driving, or "none": e is not observed.
-        sensor: delay, noise and bias of a measured e.
     """
 
     sensor: Any
@@ -78,9 +76,9 @@ class DatasetSettings:
     """Where the data come from, and how they are split.
 
     Attributes:
-        shares: of training, validation, calibration and test.
-        seed: of simulation and split.
-        steps: of a segment.
+        shares: of the training, validation, calibration and test parts.
+        seed: of the simulation and of the split.
+        steps: number of steps of a segment.
     """
 
     shares: tuple[Fraction, Fraction, Fraction, Fraction]
@@ -92,7 +90,9 @@ class DatasetSettings:
         """Return the dataclass of logs, of path coordinates or of the world."""
         if "path" in values:
             return LogSettings
-        return AlongPathSettings if "law" in values else SimulatedSettings
+        if "law" in values:
+            return AlongPathSettings
+        return SimulatedSettings
 
 
 @takes(data.generate, skip=("held_out", *_BOX))
@@ -109,16 +109,17 @@ class SimulatedSettings(DatasetSettings):
 class AlongPathSettings(DatasetSettings):
     """Simulated data in path coordinates, around a law.
 
-    Its drives are of a class, whose fields are settings too.
+    Its drives are of a `DriveClass`, whose fields are settings too.
     """
 
     law: LawSettings
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return the arguments of the generator."""
-        drives = DriveClass(**arguments(self, DriveClass))
-        return arguments(self, data.generate_along_path) | {"limits": drives}
+        """The arguments of `data.generate_along_path`."""
+        options = arguments(self, data.generate_along_path)
+        options["limits"] = DriveClass(**arguments(self, DriveClass))
+        return options
 
 
 @build.takes_logs
@@ -138,8 +139,10 @@ class TrainingSettings:
     """How a model is trained; the other fields are arguments of `training.fit`.
 
     Attributes:
-        batch: windows a step.
-        window: steps of a window.
+        loss: of `training.multi_step_loss`.
+        batch: number of windows in an optimisation step.
+        window: number of time steps of a window.
+        steps: number of optimisation steps.
     """
 
     loss: Any
@@ -157,9 +160,10 @@ class CertificationSettings:
     """What is proved and measured; the other fields are arguments of `issue`.
 
     Attributes:
+        corridor: of `certification.corridor.certify_corridor`.
         renew: whether `certify` replaces a certificate of other weights.
-        horizon: of the tubes [steps].
-        level: of the tubes.
+        horizon: number of steps of the tubes.
+        level: share of runs that the tubes shall contain.
     """
 
     corridor: Any
@@ -173,13 +177,16 @@ class EvaluationSettings:
     """Episodes, systems and sensors of the closed loop.
 
     Attributes:
-        episodes: per system.
-        episode_s: [s].
+        episodes: number of episodes for each system.
+        episode_s: length of an episode [s].
         seed: of roads, sensors and samplers.
-        systems: "self" and reference systems; none: `train` trains alone.
+        systems: "self", which is the policy of the run, and reference systems by name.
+            With an empty list `train` trains the model and does nothing else.
         observation_noise: standard deviations by name of the state; None for that which
-            the vehicle states, see `plants.KNOWN_STATES`. Other states are exact.
-        side_forces: side forces that no model knows [N].
+            the vehicle states, see `plants.KNOWN_STATES`. Other states are measured
+            exactly.
+        side_forces: largest side forces that no model knows [N]; the episodes are
+            simulated once more under each.
     """
 
     episodes: int = 8
@@ -197,17 +204,19 @@ class ComparisonSettings:
     """The rows and columns of `compare`.
 
     Attributes:
-        policies: the name that trained rows have.
-        vehicles: options of the group.
-        seeds: of the trainings.
-        controllers: controller -> scenarios.
-        own_controllers: row -> controller -> what this row has instead, or None.
-        rows: label -> overrides.
-        one_seed: labels of rows of the first seed only, such as untrained ones.
-        tuned: vehicle -> label -> more overrides.
-        only: labels of rows; empty: all.
-        share: [k, n]: evaluate every n-th row from the k-th on, collect nothing.
-        paper: what the paper prints.
+        policies: the name under which the policies of the rows are trained.
+        vehicles: options of the group `vehicle`.
+        seeds: seeds of the trainings.
+        controllers: option of the group `controller` -> the scenarios that it drives.
+        own_controllers: label of a row -> controller -> the controller that this row
+            has instead; None if it has none.
+        rows: label of a row -> its overrides.
+        one_seed: labels of the rows that are evaluated with the first seed only, such
+            as those that are not trained.
+        tuned: vehicle -> label of a row -> further overrides.
+        only: labels of the rows to evaluate; with an empty list all of them.
+        share: [k, n]: evaluate every n-th row from the k-th on, and collect nothing.
+        paper: the numbers that the paper prints, for the page of the comparison.
     """
 
     policies: Directory
@@ -230,7 +239,12 @@ class ExportSettings:
 
 @takes()
 class DemoSettings:
-    """Episodes of `demo`."""
+    """Episodes of `demo`.
+
+    Attributes:
+        episodes: number of episodes for each system.
+        episode_s: length of an episode [s].
+    """
 
     episodes: int
     episode_s: Seconds
@@ -249,7 +263,7 @@ class CollectSettings:
 
 @takes()
 class Settings:
-    """All settings of a command, see conf/config.yaml."""
+    """All settings of a command; conf/config.yaml chooses their options."""
 
     seed: NonNegativeInt
     name: Directory
@@ -311,63 +325,53 @@ class Settings:
 def parse_settings(values: Values) -> Settings:
     """Return checked settings; with `environment.source=none` the model reads no e."""
     settings = parse(Settings, values)
-    environment, reads = settings.environment, settings.model.environment
-    if environment.source == "estimated" and not reads:
+    _check_estimated(settings)
+    environment = settings.environment
+    reads_env = settings.model.environment and environment.is_known
+    vehicle = settings.vehicle
+    # Recorded with the run: whoever loads its policy need not have the simulator.
+    if simulator := getattr(vehicle, "env", None):
+        properties, env_names = described(simulator)
+        vehicle = replace(vehicle, **properties)
+        environment = replace(environment, names=environment.names or env_names)
+    _check_env_names(environment)
+    return replace(
+        settings,
+        model=replace(settings.model, environment=reads_env),
+        root=str(Path(settings.root).expanduser()),
+        vehicle=vehicle,
+        environment=environment,
+    )
+
+
+def _check_estimated(settings: Settings) -> None:
+    """Raise a ValueError if e shall be estimated where nothing can estimate it."""
+    environment = settings.environment
+    if environment.source != "estimated":
+        return
+    if not settings.model.environment:
         raise ValueError(
             "environment.source=estimated needs a model that reads the environment; "
             "drop model.environment=false"
         )
     # Whoever estimates e follows a path, and tells apart what differs.
-    constant = bool(environment.low) and environment.low == environment.high
-    if environment.source == "estimated" and (settings.logs or constant):
-        why = "logs train none" if settings.logs else f"e is always {environment.low}"
+    why = None
+    if settings.logs:
+        why = "logs train none"
+    elif environment.low and environment.low == environment.high:
+        why = f"e is always {environment.low}"
+    if why:
         raise ValueError(
             "environment.source=estimated needs a model in path coordinates and an "
             f"environment that varies: {why}; pass environment.source=measured or none"
         )
-    model = replace(settings.model, environment=reads and environment.is_known)
-    root, vehicle = str(Path(settings.root).expanduser()), settings.vehicle
-    # Recorded with the run: whoever loads its policy need not have the simulator.
-    if name := getattr(vehicle, "env", None):
-        known, names = described(name)
-        vehicle = replace(vehicle, **known)
-        environment = replace(environment, names=environment.names or names)
-    names, low = environment.names, environment.low or environment.names
-    if names and len(names) != len(low):
+
+
+def _check_env_names(environment: EnvironmentSettings) -> None:
+    """Raise a ValueError unless every entry of the box of e has a name, or none has."""
+    names = environment.names
+    if names and environment.low and len(names) != len(environment.low):
         raise ValueError(
             f"environment.low and environment.high need {len(names)} entries, "
             f"for {', '.join(names)}"
         )
-    about: dict[str, Any] = {"vehicle": vehicle, "environment": environment}
-    return replace(settings, model=model, root=root, **about)
-
-
-def register() -> None:
-    """Put the dataclasses of all groups into Hydra's store, as schemas."""
-    OmegaConf.register_new_resolver("home", os.path.expanduser, replace=True)
-    datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
-    variants: dict[str, Any] = {
-        "vehicle": build.VEHICLES,
-        "model": build.MODEL_SETTINGS,
-        "controller": build.CONTROLLER_SETTINGS,
-        "dataset": datasets,
-    }
-    for group, hint in get_type_hints(Settings).items():
-        # Of commands the primary config has the values itself.
-        if not is_dataclass(hint) or group in ("demo", "collect"):
-            continue
-        for variant, kind in variants.get(group, {"": hint}).items():
-            ConfigStore.instance().store(
-                group=group,
-                name=f"{variant}_schema".removeprefix("_"),
-                node=_writable(OmegaConf.structured(kind)),
-            )
-
-
-def _writable(node: Any) -> Any:
-    """Let Hydra write options into what OmegaConf made of a frozen dataclass."""
-    OmegaConf.set_readonly(node, None)
-    for inner in map(node._get_node, node):
-        if isinstance(inner, DictConfig):
-            _writable(inner)
-    return node

@@ -13,11 +13,13 @@ from sfkd_jax import evaluation, store
 from sfkd_jax.data import Dataset
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import data
+from sfkd_jax.experiment.dataset_files import dataset_config
 from sfkd_jax.experiment.options import Settings
 
 IDENTITY = ("vehicle", "environment", "dataset", "model", "training", "seed")
 """Settings that determine the weights of a run; of the environment, its box."""
 EPISODES = "episodes"
+"""The kind of a file of recorded episodes."""
 UNREADABLE = frozenset("[]")
 """Characters of a path that the checkpoint library writes, but reads as a pattern."""
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -25,7 +27,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 def identity(settings: Settings) -> dict[str, Any]:
     """Return the settings that determine the weights of a run, as plain values."""
-    return data.config(settings) | {
+    return {
+        **dataset_config(settings),
         "model": store.plain(settings.model),
         "training": store.plain(settings.training),
         "seed": settings.seed,
@@ -35,10 +38,15 @@ def identity(settings: Settings) -> dict[str, Any]:
 def claim(settings: Settings) -> None:
     """Record the settings of a run in its directory, or check the recorded ones.
 
-    Those of a run that failed before it kept anything are replaced.
+    The recorded settings of a run that failed before it kept anything are replaced.
+
+    Raises:
+        ArtefactError: the run was made with other settings.
+        ValueError: checkpoints could not be read back from this path.
     """
     run_dir = settings.run_dir
-    path, wanted = run_dir / "settings.json", identity(settings)
+    path = run_dir / "settings.json"
+    wanted = identity(settings)
     if unreadable := UNREADABLE & set(str(path.resolve())):
         raise ValueError(
             "checkpoints cannot be read back from a path "
@@ -62,12 +70,12 @@ def claim(settings: Settings) -> None:
 def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
     """Return the settings to store with a policy, as plain values.
 
-    Those of logged data include E, and the limits of controls unless they were given.
+    Of logged data they include E, and the limits of controls unless the settings of the
+    vehicle state them.
     """
-    recorded = identity(settings) | {
-        "controller": store.plain(settings.controller),
-        "experiment": settings.name,
-    }
+    recorded = identity(settings)
+    recorded["controller"] = store.plain(settings.controller)
+    recorded["experiment"] = settings.name
     if settings.environment.names:
         recorded["environment"]["names"] = list(settings.environment.names)
     if settings.logs:
@@ -77,7 +85,8 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
         vehicle = recorded["vehicle"]
         if vehicle["name"] == "own" and not vehicle["control_low"]:
             low, high = data.boxes(dataset)["control"]
-            vehicle |= {"control_low": low, "control_high": high}
+            vehicle["control_low"] = low
+            vehicle["control_high"] = high
     return recorded
 
 
@@ -91,29 +100,44 @@ def read_results(run_dir: Path) -> list[Row]:
 
 
 def keep_episodes(directory: Path, name: str, row: Row, arrays: Any) -> Row:
-    """Write the arrays of a row to a file below `directory`; return the row with it."""
-    about = evaluation.identity(row)
-    store.write_arrays(directory / name, arrays, kind=EPISODES, config=about)
-    return row | {"arrays": name}
+    """Write the arrays of a row to a file; return the row with the name of the file.
+
+    Args:
+        directory: of the run or the comparison.
+        name: of the file, relative to the directory.
+        row: whose episodes they are.
+        arrays: by name.
+    """
+    config = evaluation.identity(row)
+    store.write_arrays(directory / name, arrays, kind=EPISODES, config=config)
+    return {**row, "arrays": name}
 
 
 def write_results(
     run_dir: Path,
     config: Mapping[str, Any],
-    found: Sequence[tuple[Row, Mapping[str, Any]]],
+    results: Sequence[tuple[Row, Mapping[str, Any]]],
     seconds: float,
 ) -> Path:
     """Add rows and their arrays to those of a run; return the path of results.json.
 
-    Rows replace earlier ones of the same identity; other processes may add theirs at
-    the same time. `config` are plain settings and the command that was typed.
+    Rows replace earlier ones of the same identity. Other processes may add theirs at
+    the same time.
+
+    Args:
+        run_dir: of the run.
+        config: plain settings and the command that was typed.
+        results: rows with the arrays of their episodes.
+        seconds: how long the command took [s].
     """
-    path, rows = run_dir / "results.json", list[Row]()
+    path = run_dir / "results.json"
+    rows: list[Row] = []
     # Read and written under one lock, or rows of another process would be lost.
     with store.locked(run_dir, wait=True):
         # Arrays first: a row that is listed then has its episodes.
-        for row, arrays in found:
-            name = f"episodes/{store.sha256(evaluation.identity(row))[:16]}.safetensors"
+        for row, arrays in results:
+            digest = store.sha256(evaluation.identity(row))[:16]
+            name = f"episodes/{digest}.safetensors"
             rows.append(keep_episodes(run_dir, name, row, arrays))
         document = {
             "rows": evaluation.merge(read_results(run_dir), rows),
@@ -131,8 +155,9 @@ def provenance() -> dict[str, str | None]:
 
     It ends with "+" if files were changed since; outside a checkout it is None.
     """
-    commit, command = None, ["git", "-C", str(PACKAGE), "describe", "--always"]
-    command += ["--exclude=*", "--abbrev=40", "--dirty=+"]
+    describe = ["describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=+"]
+    command = ["git", "-C", str(PACKAGE), *describe]
+    commit = None
     # An installed package may lie inside the checkout of somebody else.
     if (PACKAGE.parents[1] / ".git").exists():
         with suppress(OSError, subprocess.CalledProcessError):

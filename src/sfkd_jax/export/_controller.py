@@ -29,7 +29,10 @@ other version.
 """
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 FILES = {"act": "controller", "init": "initial_state"}
-MANIFEST, SCRIPT = "controller.json", "run_controller.py"
+"""Program -> the name of its files, without a suffix."""
+MANIFEST = "controller.json"
+SCRIPT = "run_controller.py"
+"""The program in the export that runs it without sfkd_jax."""
 
 
 class Leaf(NamedTuple):
@@ -50,7 +53,8 @@ class Program(NamedTuple):
     def lower(self, *platforms: str) -> jax.export.Exported:
         """Return the program as StableHLO for platforms, including unused arguments."""
         shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in self.inputs]
-        before = getattr(jax.config, limit := "jax_traceback_in_locations_limit")
+        limit = "jax_traceback_in_locations_limit"
+        before = getattr(jax.config, limit)
         # Source locations contain paths of this machine, and the result would depend on
         # it. Other threads should not trace meanwhile.
         jax.config.update(limit, 0)
@@ -76,10 +80,10 @@ def write_controller(
     Args:
         trained: the policy.
         folder: to write; an earlier export in it is replaced.
-        platforms: that the programs are compiled for.
+        platforms: some of `PLATFORMS`, for which the programs are compiled.
         lane: (points of the road, obstacles, predicted steps of each) for a controller
             that drives in a lane; () for one that follows a reference.
-        car: its length and width [m], for a lane; None for those of the vehicle.
+        car: length and width of the car [m], for a lane; None for those of the vehicle.
         iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
     """
@@ -94,15 +98,9 @@ def write_controller(
     if lane:
         trained, ahead = in_window(trained, lane, car)
     programs = flat_programs(trained, ahead)
-    exported = {name: one.lower(*platforms) for name, one in programs.items()}
-    modules = {
-        name: _compile_iree(program.lower("cpu").mlir_module(), iree_flags)
-        for name, program in programs.items()
-        if iree
-    }
-    # First the manifest goes: a folder half written is none.
-    for stale in (MANIFEST, policy.CERTIFICATE, *(f"{f}.vmfb" for f in FILES.values())):
-        (folder / stale).unlink(missing_ok=True)
+    exported = {name: program.lower(*platforms) for name, program in programs.items()}
+    modules = _compile_all_for_iree(programs, iree_flags) if iree else {}
+    _remove_earlier_export(folder)
     # The policy too, so that `load` reads an export as it reads a run.
     path = folder / "policy.safetensors"
     stored = policy.save(path, trained.weights, trained.settings, law=trained.law)
@@ -114,18 +112,10 @@ def write_controller(
         "platforms": list(platforms),
         "key_implementation": _key_implementation(),
         "programs": {
-            name: {
-                **_write(folder / f"{FILES[name]}.stablehlo", bytes(one.serialize())),
-                "inputs": [leaf._asdict() for leaf in programs[name].inputs],
-                "outputs": [leaf._asdict() for leaf in programs[name].outputs],
-            }
-            for name, one in exported.items()
+            name: _write_program(folder, name, program, programs[name])
+            for name, program in exported.items()
         },
-        "iree": {
-            name: _write(folder / f"{FILES[name]}.vmfb", module)
-            for name, module in modules.items()
-        }
-        or None,
+        "iree": _write_modules(folder, modules) or None,
         "iree_flags": list(iree_flags) if iree else None,
         "weights_sha256": stored["sha256"],
         "certificate_sha256": _certificate(trained, folder, stored["content_sha256"]),
@@ -143,6 +133,46 @@ def write_controller(
     return manifest
 
 
+def _compile_all_for_iree(
+    programs: Mapping[str, Program], flags: Sequence[str]
+) -> dict[str, bytes]:
+    """Return the IREE module of each program, by its name."""
+    return {
+        name: _compile_iree(program.lower("cpu").mlir_module(), flags)
+        for name, program in programs.items()
+    }
+
+
+def _remove_earlier_export(folder: Path) -> None:
+    """Remove what would belong to another export than the one that is written next.
+
+    The manifest goes first: a folder without it is no export.
+    """
+    modules = [f"{file}.vmfb" for file in FILES.values()]
+    for name in (MANIFEST, policy.CERTIFICATE, *modules):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _write_program(
+    folder: Path, name: str, exported: jax.export.Exported, program: Program
+) -> dict[str, Any]:
+    """Write a program as StableHLO, and return its entry in the manifest."""
+    path = folder / f"{FILES[name]}.stablehlo"
+    return {
+        **_write(path, bytes(exported.serialize())),
+        "inputs": [leaf._asdict() for leaf in program.inputs],
+        "outputs": [leaf._asdict() for leaf in program.outputs],
+    }
+
+
+def _write_modules(folder: Path, modules: Mapping[str, bytes]) -> dict[str, Any]:
+    """Write IREE modules, and return their entries in the manifest."""
+    return {
+        name: _write(folder / f"{FILES[name]}.vmfb", module)
+        for name, module in modules.items()
+    }
+
+
 def _write(path: Path, content: bytes) -> dict[str, Any]:
     """Write a file and return its name, size and hash."""
     store.write_bytes(path, content)
@@ -151,14 +181,15 @@ def _write(path: Path, content: bytes) -> dict[str, Any]:
 
 
 def _certificate(trained: Policy, folder: Path, policy_sha256: str) -> str | None:
-    """Write the verified certificate of a policy, if any, and return the file's hash.
+    """Write the verified certificate of a policy, and return the hash of the file.
 
-    It refers to the settings as exported, perhaps with another controller.
+    It refers to the settings as exported, perhaps with another controller. None: the
+    policy has no certificate.
     """
     if trained.certificate is None:
         return None
     path = folder / policy.CERTIFICATE
-    store.write_json(path, trained.certificate | {"policy_sha256": policy_sha256})
+    store.write_json(path, {**trained.certificate, "policy_sha256": policy_sha256})
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -184,7 +215,8 @@ def flat_programs(
     key, state, *measured = _example_inputs(trained)
     names = ["observation", "env", "reference"]
     if ahead is not None:
-        names[2:], measured[2:] = ahead, ahead.values()
+        names = [*names[:2], *ahead]
+        measured = [*measured[:2], *ahead.values()]
     wrap = partial(jax.random.wrap_key_data, impl=_key_implementation())
     # Flat and named: other programs know neither pytrees nor keys.
     template, structure = jax.tree.flatten(state)
@@ -193,18 +225,17 @@ def flat_programs(
         return tuple(_unpack(init(wrap(key_data))))
 
     def flat_act(*leaves: Array) -> tuple[Array, ...]:
-        # What is measured follows the state.
-        before = [
-            wrap(leaf) if _is_key(like) else leaf
-            for like, leaf in zip(template, leaves, strict=False)
+        # The leaves of the state come first, then what is measured.
+        state_leaves = [
+            wrap(leaf) if _is_key(example) else leaf
+            for example, leaf in zip(template, leaves, strict=False)
         ]
-        given = leaves[len(template) :]
+        measurements = leaves[len(template) :]
         # Without the barrier XLA evaluates functions of the weights at compile time and
         # rounds differently.
         params = jax.lax.optimization_barrier(trained.params)
-        control, after, info = act(
-            params, jax.tree.unflatten(structure, before), *given
-        )
+        before = jax.tree.unflatten(structure, state_leaves)
+        control, after, info = act(params, before, *measurements)
         return control, *_unpack(after), *jax.tree.leaves(info)
 
     control, after, info = jax.eval_shape(act, trained.params, state, *measured)
@@ -228,25 +259,33 @@ def in_window(
 ) -> tuple[Policy, dict[str, jax.ShapeDtypeStruct]]:
     """Return a policy in its lane that takes a scene as arrays, and their shapes.
 
-    The road is a window of points; `moved` tells by how many of them it has moved on
-    since the step before. It reaches from behind the car to beyond what is planned, or
-    the car stops at its end.
+    The road is a window of points. `moved` is by how many of them the window has moved
+    on since the step before. It must reach from behind the car to beyond what is
+    planned, or the car stops at its end.
+
+    Args:
+        trained: the policy.
+        lane: (points of the road, obstacles, predicted steps of each).
+        car: length and width of the car [m].
     """
     if len(lane) != 3 or min(lane) < 1:
         raise ValueError(
             "export.lane must be [points of the road, obstacles, predicted steps], "
             f"got {list(lane)}"
         )
-    driver, (points, count, steps) = trained.in_lane(car=(car[0], car[1])), lane
+    points, obstacles, steps = lane
+    driver = trained.in_lane(car=(car[0], car[1]))
     shapes: dict[str, tuple[int, ...]] = {
         "road": (points, 4),
         "spacing": (),
-        **dict.fromkeys(("left", "right", "speed"), (points,)),
-        "position": (count, steps, 2),
-        "yaw": (count,),
-        "half": (count, 2),
-        "radius": (count,),
-        "present": (count,),
+        "left": (points,),
+        "right": (points,),
+        "speed": (points,),
+        "position": (obstacles, steps, 2),
+        "yaw": (obstacles,),
+        "half": (obstacles, 2),
+        "radius": (obstacles,),
+        "present": (obstacles,),
         "moved": (),
     }
 
@@ -262,25 +301,31 @@ def in_window(
         )
         return driver.act(params, state, observation, env, scene)
 
-    kinds = {"present": bool, "moved": jnp.int32}
-    return replace(trained, controller=Controller(driver.init, act)), {
-        name: jax.ShapeDtypeStruct(shape, kinds.get(name, jnp.float32))
+    dtypes = {"present": bool, "moved": jnp.int32}
+    ahead = {
+        name: jax.ShapeDtypeStruct(shape, dtypes.get(name, jnp.float32))
         for name, shape in shapes.items()
     }
+    return replace(trained, controller=Controller(driver.init, act)), ahead
 
 
 def _example_inputs(trained: Policy) -> tuple[Any, ...]:
-    """The shapes of key, controller state, observation, env and reference."""
+    """Return the shapes of key, controller state, observation, env and reference."""
     key = jax.eval_shape(partial(jax.random.key, 0))
+    state = jax.eval_shape(trained.controller.init, key)
     settings = trained.settings
-    sizes = (len(trained.vehicle.state_names),), (len(settings["space"]["env_mean"]),)
-    shapes = *sizes, (build.controller_horizon(settings["controller"]), 4)
-    measured = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
-    return key, jax.eval_shape(trained.controller.init, key), *measured
+    horizon = build.controller_horizon(settings["controller"])
+    return (
+        key,
+        state,
+        jax.ShapeDtypeStruct((len(trained.vehicle.state_names),), jnp.float32),
+        jax.ShapeDtypeStruct((len(settings["space"]["env_mean"]),), jnp.float32),
+        jax.ShapeDtypeStruct((horizon, 4), jnp.float32),
+    )
 
 
 def _key_implementation() -> str:
-    """The name of the random generator, whose key's shape a program has."""
+    """Return the name of the random generator; the shape of a key depends on it."""
     return str(jax.random.key_impl(jax.random.key(0)))
 
 
@@ -297,7 +342,7 @@ def _unpack(tree: Any) -> list[Array]:
 
 
 def _leaf(name: str, value: Any) -> Leaf:
-    """Name, shape and dtype of an array, or of the data of a key."""
+    """Return name, shape and dtype of an array, or of the data of a key."""
     data = jax.eval_shape(jax.random.key_data, value) if _is_key(value) else value
     return Leaf(name, tuple(data.shape), str(data.dtype))
 

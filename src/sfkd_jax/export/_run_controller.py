@@ -35,7 +35,7 @@ FORMAT = 2
 CELL = 2048.0
 """Spacing of the origins that positions are made relative to [m]."""
 PLACES = ("observation", "reference", "road", "position")
-"""Inputs that begin with x and y [m]; the third of all inputs is what is ahead."""
+"""Inputs that begin with x and y [m]."""
 MALFORMED = (
     *(KeyError, TypeError, ValueError, IndexError, AttributeError),
     *(OverflowError, RecursionError),
@@ -48,9 +48,9 @@ class ExportError(Exception):
 
     def __init__(self, path: Path, reason: object) -> None:
         """Shorten to one printable line."""
-        words = " ".join(f"{path}: {reason}".split())
+        text = " ".join(f"{path}: {reason}".split())
         # A file may put anything into its message, also what moves a cursor.
-        line = "".join(x if x.isprintable() else " " for x in words)
+        line = "".join(letter if letter.isprintable() else " " for letter in text)
         super().__init__(line[:500])
 
 
@@ -67,9 +67,8 @@ class ExportedController:
         path = Path(folder) / "controller.json"
         try:
             self.manifest = _manifest(path)
-            self._init, self._act = (
-                _compiled(path.parent, self.manifest, name) for name in ("init", "act")
-            )
+            self._init = _compiled(path.parent, self.manifest, "init")
+            self._act = _compiled(path.parent, self.manifest, "act")
         except MALFORMED as error:
             reason = f"malformed, {type(error).__name__}: {error}"
             raise ExportError(path, reason) from None
@@ -102,50 +101,81 @@ class ExportedController:
             elapsed: sampling periods since the last call; None for one.
         """
         expected = self.manifest["programs"]["act"]["inputs"]
-        names = [x["name"] for x in expected if not x["name"].startswith("state.")]
-        measured = {"observation": observation, "env": env}
-        measured |= reference if isinstance(reference, dict) else {names[-1]: reference}
-        if set(measured) != set(names):
-            raise ValueError(f"inputs must be {names}, got {list(measured)}")
-        given = {f"state.{name}": value for name, value in state.items()} | {
-            name: np.asarray(measured[name]) for name in names
-        }
-        # By name and order: two states may have the same shapes.
-        if list(given) != [leaf["name"] for leaf in expected]:
-            raise ValueError(
-                "state must be what init or the last act of this controller returned"
-            )
-        for leaf, value in zip(expected, given.values(), strict=True):
-            if value.shape != tuple(leaf["shape"]):
-                raise ValueError(
-                    f"{leaf['name']} must have shape {tuple(leaf['shape'])}, "
-                    f"got {value.shape}"
-                )
-        places = {name: given[name] for name in PLACES if name in names}
+        inputs = self._inputs(expected, state, observation, env, reference)
+        names = [name for name in inputs if not name.startswith("state.")]
         origin = np.zeros(2)
+        places = [name for name in names if name in PLACES]
         # As `sfkd_jax.relative`: before the cast, and never of what was float32 before.
-        if min(place.dtype.itemsize for place in places.values()) == 8:
-            near = np.nan_to_num(given[names[2]][0, :2], posinf=0.0, neginf=0.0)
-            origin = CELL * np.round(near / CELL)
-            given |= {name: _shifted(place, -origin) for name, place in places.items()}
+        if min(inputs[name].dtype.itemsize for name in places) == 8:
+            # The first point of what is ahead: the road, or the reference.
+            first_point = inputs[names[2]][0, :2]
+            first_point = np.nan_to_num(first_point, posinf=0.0, neginf=0.0)
+            origin = CELL * np.round(first_point / CELL)
+            for name in places:
+                inputs[name] = _shifted(inputs[name], -origin)
         for leaf in expected:
-            if (name := leaf["name"]) in measured:
-                given[name] = given[name].astype(leaf["dtype"])
+            name = leaf["name"]
+            if name in names:
+                inputs[name] = inputs[name].astype(leaf["dtype"])
             elif name.endswith("tuning.elapsed") and elapsed is not None:
-                given[name] = np.asarray(elapsed, np.float32)
-        values = self._act(*given.values())
-        state, info = (self._named("act", root, values) for root in ("state", "info"))
-        if not np.all(info.get("env_inside", True)):
-            box = zip(*self.manifest["environment"].values(), strict=True)
-            told = ", ".join(
-                f"{name} {low:.3g} … {high:.3g}" for name, low, high in box
-            )
-            warnings.warn(f"e left {told}: no corridor. The unit?", stacklevel=2)
+                inputs[name] = np.asarray(elapsed, np.float32)
+        values = self._act(*inputs.values())
+        after = self._named("act", "state", values)
+        info = self._named("act", "info", values)
+        self._warn_outside_box(info)
         if origin.any():
             for name in {"predicted_states", "reference"} & set(info):
                 moved: Any = _shifted(info[name], origin)
                 info[name] = moved
-        return values[0], state, info
+        return values[0], after, info
+
+    def _inputs(
+        self,
+        expected: list[dict[str, Any]],
+        state: dict[str, jax.Array],
+        observation: Any,
+        env: Any,
+        reference: Any,
+    ) -> dict[str, Any]:
+        """Return the inputs of the program by name, or raise a ValueError."""
+        names = [
+            leaf["name"] for leaf in expected if not leaf["name"].startswith("state.")
+        ]
+        measured = {"observation": observation, "env": env}
+        if isinstance(reference, dict):
+            measured.update(reference)
+        else:
+            measured[names[-1]] = reference
+        if set(measured) != set(names):
+            raise ValueError(f"inputs must be {names}, got {list(measured)}")
+        inputs: dict[str, Any] = {}
+        for name, value in state.items():
+            inputs[f"state.{name}"] = value
+        for name in names:
+            inputs[name] = np.asarray(measured[name])
+        # By name and order: two states may have the same shapes.
+        if list(inputs) != [leaf["name"] for leaf in expected]:
+            raise ValueError(
+                "state must be what init or the last act of this controller returned"
+            )
+        for leaf in expected:
+            name = leaf["name"]
+            shape = tuple(leaf["shape"])
+            if inputs[name].shape != shape:
+                raise ValueError(
+                    f"{name} must have shape {shape}, got {inputs[name].shape}"
+                )
+        return inputs
+
+    def _warn_outside_box(self, info: dict[str, Any]) -> None:
+        """Warn if e is outside its box, where no corridor holds."""
+        if np.all(info.get("env_inside", True)):
+            return
+        box = self.manifest["environment"]
+        rows = zip(box["names"], box["low"], box["high"], strict=True)
+        limits = ", ".join(f"{name} {low:.3g} … {high:.3g}" for name, low, high in rows)
+        # 3: `act` stands between this function and its caller.
+        warnings.warn(f"e left {limits}: no corridor. The unit?", stacklevel=3)
 
     def _named(self, program: str, root: str, values: Any) -> dict[str, jax.Array]:
         """Return the outputs below `root` by name, without the prefix."""
@@ -158,7 +188,7 @@ class ExportedController:
 
 
 def _shifted(states: Any, by: np.ndarray) -> np.ndarray:
-    """Return states at positions moved `by`, in float64."""
+    """Return states whose positions are moved by (x, y) [m], in float64."""
     moved = np.array(states, np.float64)
     moved[..., :2] += by
     return moved
@@ -170,8 +200,9 @@ def _manifest(path: Path) -> dict[str, Any]:
     if manifest["kind"] != "controller":
         raise ExportError(path, "not the manifest of a controller")
     if manifest["format"] != FORMAT:
-        found = f"is of format {manifest['format']}"
-        raise ExportError(path, f"{found}, this file reads {FORMAT}")
+        raise ExportError(
+            path, f"is of format {manifest['format']}, this file reads {FORMAT}"
+        )
     hashed = {name: value for name, value in manifest.items() if name != "sha256"}
     text = json.dumps(hashed, sort_keys=True)
     if hashlib.sha256(text.encode()).hexdigest() != manifest["sha256"]:
@@ -218,35 +249,53 @@ def main() -> None:
         names = [entry["name"] for entry in controller.manifest["controls"]]
     except (ExportError, *MALFORMED) as reason:
         sys.exit(f"run_controller: {type(reason).__name__}: {reason}")
-    state, controls, times = controller.init(), [], []
+    state = controller.init()
+    controls = []
+    times = []
     # The car stands still: what is checked is the program, not the driving.
     for _ in range(arguments.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, *measured)
         controls.append(np.asarray(control).tolist())
         times.append(1e3 * (time.perf_counter() - began))
-    result = {"names": names, "controls": controls}
-    print(json.dumps(result | {"median_ms": float(np.median(times))}))
+    result = {
+        "names": names,
+        "controls": controls,
+        "median_ms": float(np.median(times)),
+    }
+    print(json.dumps(result))
 
 
 def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Observation, environment and reference of a car 0.3 m beside a straight road."""
-    inputs = manifest["programs"]["act"]["inputs"]
-    arrays = {x["name"]: np.zeros(x["shape"], x["dtype"]) for x in inputs}
-    ahead = {name: x for name, x in arrays.items() if not name.startswith("state.")}
-    observation, _ = ahead.pop("observation"), ahead.pop("env")
-    speed, dt = 10.0, manifest["sampling_period_s"]
-    observation[1], observation[3] = 0.3, speed
-    line = next(iter(ahead.values()))
+    """Return the inputs of a car 0.3 m beside a straight road, after the state.
+
+    These are observation, environment and reference; in a lane the last is a dict of
+    all other inputs.
+    """
+    speed = 10.0
+    leaves = manifest["programs"]["act"]["inputs"]
+    ahead = {
+        leaf["name"]: np.zeros(leaf["shape"], leaf["dtype"])
+        for leaf in leaves
+        if not leaf["name"].startswith("state.")
+    }
+    observation = ahead.pop("observation")
+    observation[1] = 0.3
+    observation[3] = speed
+    del ahead["env"]
     if "reference" in ahead:
-        line[:, 3], spacing = speed, speed * dt
+        points = ahead["reference"]
+        points[:, 3] = speed
+        spacing = speed * manifest["sampling_period_s"]
     else:
-        # A free lane.
+        # A free lane: 5 m to each side, and no obstacle is present.
+        points = ahead["road"]
         spacing = 0.5
-        ahead |= {"spacing": np.asarray(spacing)}
-        ahead |= {name: ahead[name] + 5.0 for name in ("left", "right")}
+        ahead["spacing"] = np.asarray(spacing)
+        for name in ("left", "right"):
+            ahead[name] = ahead[name] + 5.0
         ahead["speed"] = ahead["speed"] + speed
-    line[:, 0] = spacing * np.arange(1, len(line) + 1)
+    points[:, 0] = spacing * np.arange(1, len(points) + 1)
     box = manifest["environment"]
     return observation, np.mean([box["low"], box["high"]], axis=0), ahead
 

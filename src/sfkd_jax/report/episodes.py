@@ -16,17 +16,22 @@ from sfkd_jax.report.tables import name_of
 
 
 class Episodes(NamedTuple):
-    """The stored episodes of a row."""
+    """The stored episodes of a row.
+
+    Attributes:
+        row: of results.json.
+        dt: sampling period [s].
+        lateral: signed deviation of x_1 … x_T from the path [m], left positive.
+        states: x_0 … x_T of the first episode, beginning with x, y, yaw.
+        envs: friction and wind [m/s] at every step of the first episode.
+        path: x, y, yaw, curvature along the road of the first episode.
+    """
 
     row: Row
     dt: float
-    # Signed deviation of x_1 … x_T from the path [m], left positive.
     lateral: Float[np.ndarray, "episode time"]
-    # x_0 … x_T of the first episode, beginning with x, y, yaw.
     states: Float[np.ndarray, "time_plus_1 state"] | None
-    # Friction and wind [m/s] at every step of the first episode.
     envs: Float[np.ndarray, "time 2"] | None
-    # x, y, yaw, curvature along the road of the first episode.
     path: Float[np.ndarray, "point column"] | None
 
     @property
@@ -42,38 +47,55 @@ class Episodes(NamedTuple):
     @property
     def switches(self) -> list[int]:
         """Steps at which friction or wind switch in the first episode."""
-        return [] if self.envs is None else np.flatnonzero(switches(self.envs)).tolist()
+        if self.envs is None:
+            return []
+        return np.flatnonzero(switches(self.envs)).tolist()
 
 
-def by_road(episodes: list[Episodes]) -> list[list[Episodes]]:
-    """Episodes that may be compared, on one road; the one with most switches first."""
+def by_road(all_episodes: list[Episodes]) -> list[list[Episodes]]:
+    """Group episodes that may be compared, which are those on one road.
+
+    The group with most switches of the environment comes first.
+    """
+
+    def order_of_tables(episodes: Episodes) -> tuple[Any, ...]:
+        return rank(episodes.system), episodes.name
+
+    def most_switches_first(group: list[Episodes]) -> int:
+        return -len(group[0].switches)
+
     groups: dict[tuple[Any, ...], list[Episodes]] = {}
-    for one in sorted(episodes, key=lambda one: (rank(one.system), one.name)):
+    for episodes in sorted(all_episodes, key=order_of_tables):
+        columns = [episodes.row.get(column) for column in SHARED]
         # By content: rows met the same road only if every byte of it is equal.
-        road = (None if a is None else a.tobytes() for a in (one.envs, one.path))
-        key = (*(one.row.get(column) for column in SHARED), *road)
-        groups.setdefault(key, []).append(one)
-    return sorted(groups.values(), key=lambda group: -len(group[0].switches))
+        road = [
+            None if array is None else array.tobytes()
+            for array in (episodes.envs, episodes.path)
+        ]
+        groups.setdefault((*columns, *road), []).append(episodes)
+    return sorted(groups.values(), key=most_switches_first)
 
 
 def of_rows(directory: Path, rows: list[Row]) -> list[Episodes]:
-    """The episodes of those rows whose arrays exist below the directory."""
-    found = []
+    """Return the episodes of those rows whose arrays exist below the directory."""
+    stored = []
     for row in rows:
         name = PurePath(str(row.get("arrays")))
         # A row of somebody else's file must not make us read files elsewhere.
         if name.is_absolute() or ".." in name.parts:
             outside = "arrays of a row lie outside this folder"
             raise store.ArtefactError(f"{directory / 'results.json'}: {outside}")
-        if (directory / name).is_file():
-            arrays = store.read_arrays(directory / name, kind="episodes")[0]
-            one = _episodes(row, arrays)
-            found += [one] if one else []
-    return found
+        if not (directory / name).is_file():
+            continue
+        arrays, _ = store.read_arrays(directory / name, kind="episodes")
+        episodes = _episodes(row, arrays)
+        if episodes is not None:
+            stored.append(episodes)
+    return stored
 
 
 def _episodes(row: Row, arrays: dict[str, np.ndarray]) -> Episodes | None:
-    """The episodes of a row, None without a finite deviation."""
+    """Return the episodes of a row, or None if no deviation is finite."""
     dt = float(arrays.get("dt", 0.1))
     lateral = np.asarray(arrays.get("lateral", np.zeros((0, 0))), dtype=float)
     # All NaN, as of a run that diverged at once: there is nothing to draw.
@@ -84,4 +106,11 @@ def _episodes(row: Row, arrays: dict[str, np.ndarray]) -> Episodes | None:
         for name, values in arrays.items()
         if values.ndim > 1 and values.size
     }
-    return Episodes(row, dt, lateral, *map(first.get, ("states", "envs", "path")))
+    return Episodes(
+        row=row,
+        dt=dt,
+        lateral=lateral,
+        states=first.get("states"),
+        envs=first.get("envs"),
+        path=first.get("path"),
+    )

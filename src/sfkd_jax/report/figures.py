@@ -24,16 +24,27 @@ _FEW = (*_ALWAYS, "nominal", "koopman_mpc", "neural_ode", "icode_mppi")
 def first_episode(
     group: list[Episodes], corridor: float | None = None, seconds: float = 15.0
 ) -> Figure:
-    """Lateral errors on one road over time [s], and friction and wind below them."""
-    first, envs = group[0], group[0].envs
+    """Draw lateral errors on one road over time, and friction and wind below them.
+
+    Args:
+        group: of episodes on one road.
+        corridor: half width of the certified corridor [m], or None.
+        seconds: how much of the episode is drawn [s].
+    """
+    first = group[0]
+    envs = first.envs
     # Many lines in one panel hide each other.
     if len(group) > len(_FEW):
-        group = [one for one in group if one.system in _FEW] or group
+        group = [episodes for episodes in group if episodes.system in _FEW] or group
     # As long as the shortest run: all lines end at the same time.
-    last = min(round(seconds / first.dt), *(one.lateral.shape[1] for one in group))
-    heights = [2.4] + [0.7, 0.7] * (envs is not None)
+    lengths = [episodes.lateral.shape[1] for episodes in group]
+    last = min(round(seconds / first.dt), *lengths)
+    heights = [2.4]
+    if envs is not None:
+        heights += [0.7, 0.7]
     figure = style.canvas(0.8 + sum(heights))
-    axes = [*figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]]
+    panels = figure.subplots(len(heights), height_ratios=heights, squeeze=False)
+    axes = [*panels[:, 0]]
     axes[0].set_title("Lateral error in the first episode")
     _draw_errors(axes[0], group, last, corridor)
     if envs is not None:
@@ -67,15 +78,19 @@ def _draw_conditions(
 def _draw_errors(
     axes: Any, members: list[Episodes], last: int, corridor: float | None
 ) -> None:
-    """Lateral error over time."""
+    """Draw the lateral errors of the first steps over time."""
     axes.axhline(0.0, color=style.AXIS, linewidth=0.8)
-    peaks, always = [], [1e-3, corridor or 0.0]
-    for one in members:
-        values = one.lateral[0, :last]
-        time = one.dt * np.arange(1, len(values) + 1)
-        axes.plot(time, values, **style.line(one.system, one.name))
-        peaks.append(float(np.nanmax(np.abs(values), initial=0.0)))
-        always += peaks[-1:] if one.system in _ALWAYS else []
+    peaks = []
+    # The frame shows these levels whatever the others are.
+    always = [1e-3, corridor or 0.0]
+    for episodes in members:
+        values = episodes.lateral[0, :last]
+        time = episodes.dt * np.arange(1, len(values) + 1)
+        axes.plot(time, values, **style.line(episodes.system, episodes.name))
+        peak = float(np.nanmax(np.abs(values), initial=0.0))
+        peaks.append(peak)
+        if episodes.system in _ALWAYS:
+            always.append(peak)
     if corridor:
         style.draw_corridor(axes, corridor)
     # Of the others a bad one may leave the frame, lest it flatten the rest.
@@ -89,34 +104,38 @@ def _draw_errors(
 
 
 def open_loop(errors: dict[str, Any], radii: list[Any]) -> Figure:
-    """Position RMSE of prediction without feedback by time ahead.
+    """Draw the position RMSE of prediction without feedback by time ahead.
 
-    `radii` are those of the certified position tube [m] by step, if there is one.
+    Args:
+        errors: content of open_loop.json.
+        radii: of the certified position tube [m] by step; [] if there is none.
     """
     figure = style.canvas(3.2)
     axes = figure.subplots()
-    known = is_number(errors.get("dt"))
-    ahead = np.asarray(errors["steps"], float) * (errors["dt"] if known else 1.0)
+    period_is_known = is_number(errors.get("dt"))
+    period = errors["dt"] if period_is_known else 1.0
+    ahead = period * np.asarray(errors["steps"], float)
     key = "position_rmse_m"
     curves = {"model": errors.get(key), "certified tube": radii}
     for name, record in (errors.get("baselines") or {}).items():
         curves[name.replace("_", " ")] = dig(record, key)
-    colours = style.ACCENT, style.DARK, "#d55e00", style.THIRD
-    looks = zip(curves.items(), colours, ("-", ":", "--", "-."), strict=False)
+    colours = (style.ACCENT, style.DARK, "#d55e00", style.THIRD)
+    dashes = ("-", ":", "--", "-.")
+    looks = zip(curves.items(), colours, dashes, strict=False)
     for (name, values), color, dash in looks:
         if values:
             # As floats, null is NaN: a gap in the curve.
-            look: Any = {"label": name, "color": color, "linestyle": dash}
-            axes.plot(ahead, np.asarray(values, float), **look)
+            numbers = np.asarray(values, float)
+            axes.plot(ahead, numbers, label=name, color=color, linestyle=dash)
     axes.set(ylabel="error of position [m]", xlim=(0, ahead[-1]))
-    axes.set_xlabel("time ahead [s]" if known else "steps ahead")
+    axes.set_xlabel("time ahead [s]" if period_is_known else "steps ahead")
     _plain_log(axes.yaxis, axes.set_yscale)
     style.legend(figure, axes)
     return figure
 
 
 def learning(lines: list[dict[str, Any]]) -> Figure:
-    """Loss by optimisation step, on training windows and on validation runs."""
+    """Draw the loss by optimisation step, on training and on validation windows."""
     figure = style.canvas(2.8)
     axes = figure.subplots()
     for name, color in (("loss", style.SECOND), ("validation_loss", style.ACCENT)):
@@ -129,27 +148,31 @@ def learning(lines: list[dict[str, Any]]) -> Figure:
 
 
 def side_forces(rows: list[Row]) -> Figure:
-    """RMSE of every system under unmeasured side forces; larger dots: larger forces."""
+    """Draw the RMSE of every system under unmeasured side forces.
+
+    Larger dots are larger forces.
+    """
     figure = style.canvas(1.3 + 0.24 * len(rows))
-    axes, forces = figure.subplots(), {}
+    axes = figure.subplots()
+    size_of: dict[float, float] = {}
     for height, row in enumerate(rows):
         runs = [
-            one for one in row["disturbed"] if is_number(dig(one, "rmse_m", "mean"))
+            run for run in row["disturbed"] if is_number(dig(run, "rmse_m", "mean"))
         ]
-        errors = [1e3 * one["rmse_m"]["mean"] for one in runs]
+        errors = [1e3 * run["rmse_m"]["mean"] for run in runs]
         color = style.line(str(row.get("system")))["color"]
         axes.plot(errors, [height] * len(runs), color=color, linewidth=1.6, alpha=0.5)
-        for one, error in zip(runs, errors, strict=True):
-            force = one["force_n"]
-            forces[force] = size = 10.0 + 0.07 * force
-            axes.scatter(error, height, size, color=color, zorder=3)
-    for force, size in sorted(forces.items()):
+        for run, error in zip(runs, errors, strict=True):
+            force = run["force_n"]
+            size_of[force] = 10.0 + 0.07 * force
+            axes.scatter(error, height, size_of[force], color=color, zorder=3)
+    for force, size in sorted(size_of.items()):
         axes.scatter([], [], size, color=style.MUTED, label=f"{force:g} N")
     axes.set_xlabel("lateral RMSE [mm]")
     _plain_log(axes.xaxis, axes.set_xscale)
     names = [style.literal(name_of(row)) for row in rows]
     axes.set_yticks(range(len(names)), names)
-    # The first above.
+    # The first row is above the others.
     axes.set_ylim(len(names) - 0.4, -0.6)
     style.legend(figure, axes, title="largest side force that nobody measures")
     return figure
@@ -159,6 +182,12 @@ def _plain_log(axis: Any, set_scale: Any) -> None:
     """Make an axis logarithmic, with plain numbers at few ticks."""
     set_scale("log")
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 50 * low else (1,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ticks_per_decade = (1, 2, 5) if high < 50 * low else (1,)
+    axis.set_major_locator(LogLocator(subs=ticks_per_decade))
+    axis.set_major_formatter(FuncFormatter(_plain_number))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _plain_number(value: float, position: int | None) -> str:
+    """Return the label of a tick, without an exponent."""
+    return f"{value:g}"

@@ -33,10 +33,10 @@ class Section(NamedTuple):
 
 
 def write_page(title: str, sections: list[Section], home: Path) -> dict[str, object]:
-    """Write home/index.html, return where it and its images are.
+    """Write home/index.html; return where it and its images are.
 
-    It has its figures inside, and links films, which are larger; sections without parts
-    are left out.
+    The page contains its figures, and links films, which are larger. Sections without
+    parts are left out.
     """
     sections = [section for section in sections if section.parts]
     filled = _ENVIRONMENT.get_template("page.html").render(
@@ -53,7 +53,7 @@ def write_page(title: str, sections: list[Section], home: Path) -> dict[str, obj
 
 
 def to_latex(captions: list[tuple[str, pd.DataFrame]]) -> str:
-    """Tables with their captions as floats for booktabs."""
+    """Return tables with their captions as floats for booktabs."""
     text = "% Needs \\usepackage{booktabs}.\n"
     for caption, frame in captions:
         words = re.sub(r"([&%$#_{}])", r"\\\1", caption.replace("\\", "/"))
@@ -68,7 +68,7 @@ def to_latex(captions: list[tuple[str, pd.DataFrame]]) -> str:
 
 
 def _as_html(part: Part, home: Path) -> str:
-    """A part of a page as HTML; whatever a table or a text holds is escaped."""
+    """Return a part of a page as HTML; what a table or a text holds is escaped."""
     if isinstance(part, str):
         return f"<p>{html.escape(part)}</p>"
     if isinstance(part, Picture):
@@ -78,13 +78,18 @@ def _as_html(part: Part, home: Path) -> str:
             source = f"data:image/png;base64,{data}"
         return f'<img alt="{html.escape(part.alt)}" src="{source}">'
     # Numbers stand below each other by their last digit, words begin on the left.
-    digits = part.map(lambda cell: cell[:1] in "0123456789−–<").mean().mean()
-    kind = "numbers" if digits > 0.5 else "words"
+    share_of_numbers = part.map(_begins_with_a_number).mean().mean()
+    css_class = "numbers" if share_of_numbers > 0.5 else "words"
     with pd.option_context("display.max_colwidth", None):
-        rows = part.to_html(classes=kind, border=0, escape=True, justify="right")
+        rows = part.to_html(classes=css_class, border=0, escape=True, justify="right")
     # The row of this project's model is marked.
     rows = re.sub(r"<tr>(\s*<th>SFKD</th>)", r'<tr class="strong">\1', rows)
     return f'<div class="scroll">{rows}</div>'
+
+
+def _begins_with_a_number(cell: str) -> bool:
+    """Return whether a cell shows a number, perhaps with a sign or as a bound."""
+    return cell[:1] in "0123456789−–<"
 
 
 _ENVIRONMENT = Environment(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -34,10 +34,17 @@ PROOF = (
     "the file can change such a number within its range. Outside the boxes nothing is "
     "claimed."
 )
+
+
+def _range(ends: list[Any] | None) -> str:
+    """Return the ends of a range as text, "3 to 6"."""
+    return " to ".join(map(short, ends or [None]))
+
+
 _WRITERS = {
     "interval": formats.interval,
     "plain": plain,
-    "range": lambda ends: " to ".join(map(short, ends or [None])),
+    "range": _range,
     "percent": formats.percent,
     "short": short,
     "upper": formats.upper,
@@ -48,10 +55,14 @@ _WRITERS = {
 def write_report(run_dir: Path) -> dict[str, Any]:
     """Write `run_dir/report/`: index.html, figures and a film.
 
-    Recomputes no number of the run, whose files may be missing but for the policy; the
-    same inputs give the same bytes. Returns the paths of the page and of its images.
+    No number of the run is computed again. All its files but the policy may be missing.
+    The same inputs give the same bytes.
+
+    Returns:
+        The paths of the page and of its images.
     """
-    home, weights = run_dir / "report", run_dir / f"policy{store.SUFFIX}"
+    home = run_dir / "report"
+    weights = run_dir / f"policy{store.SUFFIX}"
     with store.as_artefact_error(home):
         if not weights.exists():
             makes = "python -m sfkd_jax.train makes a run"
@@ -59,7 +70,8 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         images = empty_folder(home / "figures")
         _, policy = store.read_arrays(weights, kind="policy")
         settings = policy.get("config") or {}
-        model, experiment = settings.get("model"), settings.get("experiment")
+        model = settings.get("model")
+        experiment = settings.get("experiment")
         system = str(dig(model, "system") or dig(model, "name") or "sfkd")
         title = f"{style.label(system)}, {plain(experiment or 'unnamed run')}"
         sections = _sections(run_dir, policy, images)
@@ -69,23 +81,24 @@ def write_report(run_dir: Path) -> dict[str, Any]:
 
 
 def read_optional(path: Path) -> dict[str, Any]:
-    """The JSON object in a file, empty without a file."""
+    """Return the JSON object in a file; it is empty if there is no file."""
     return store.read_json(path) if path.exists() else {}
 
 
 def certificate_document(run: Path, policy: dict[str, Any]) -> dict[str, Any]:
-    """The certificate of a run; one about other weights is not valid."""
+    """Return the certificate of a run; one about other weights is not valid."""
     certificate = read_optional(run / "certificate.json")
-    own, named = policy.get("sha256"), certificate.get("weights_sha256")
+    weights = policy.get("sha256")
+    certified_weights = certificate.get("weights_sha256")
     # Valid for other weights is not valid here: the page must not show it.
-    if own and named and own != named:
+    if weights and certified_weights and weights != certified_weights:
         reason = "the certificate in this run is about other weights"
         return {"valid": False, "reason": reason}
     return certificate
 
 
 def holds(certificate: dict[str, Any]) -> bool:
-    """Whether a certificate is valid, with a contraction factor below one."""
+    """Return whether a certificate is valid, with a contraction factor below one."""
     alpha: Any = certificate.get("alpha")
     return certificate.get("valid") is True and is_number(alpha) and alpha < 1
 
@@ -100,42 +113,48 @@ def empty_folder(folder: Path) -> Path:
 
 
 def made_with(config: dict[str, Any], versions: Any) -> Section:
-    """The command, the settings and the versions that made something, folded."""
-    parts: list[Part] = [record_table("Setting", config, "value")]
-    parts.append(record_table("Package", versions or {}, "version"))
+    """Return a folded section with the command, the settings and the versions."""
+    parts: list[Part] = [
+        record_table("Setting", config, "value"),
+        record_table("Package", versions or {}, "version"),
+    ]
     return Section("Command, settings and versions", parts, folded=True)
 
 
 def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Section]:
-    """All sections of the page; a file whose content does not fit is named."""
+    """Return all sections of the page; an error names the file that does not fit."""
     results = read_optional(run_dir / "results.json")
     certificate = certificate_document(run_dir, policy)
     # Numbers of a certificate that does not hold are nowhere drawn.
     proof = certificate if holds(certificate) else {}
-    half = dig(proof, "corridor", "corridor_m")
+    half_width = dig(proof, "corridor", "corridor_m")
     missing: list[Part] = [
         f"{name} is missing: python -m sfkd_jax.{command} makes it."
         for name, command in MADE_BY.items()
         if not (run_dir / name).exists()
     ]
-    drawn = partial(_driven, run_dir, half, images)
     sections = [Section("", missing)]
-    for title, file, make in (
-        ("Closed loop", "results.json", lambda: _scores(results)),
-        ("Episodes", "results.json", lambda: drawn(results.get("rows"))),
-        ("Certificate", "certificate.json", lambda: _certified(certificate, policy)),
-        ("Open loop", "open_loop.json", lambda: _predicted(run_dir, proof, images)),
-        ("Training", "metrics.jsonl", lambda: _learned(run_dir, images)),
-    ):
+
+    def add(
+        title: str, file: str, make: Callable[..., list[Part]], *inputs: Any
+    ) -> None:
         with store.as_artefact_error(run_dir / file, ValueError):
-            sections.append(Section(title, make()))
-    command = {"command": dig(results, "config", "command")}
+            sections.append(Section(title, make(*inputs)))
+
+    rows = results.get("rows")
+    add("Closed loop", "results.json", _scores, results)
+    add("Episodes", "results.json", _driven, run_dir, half_width, images, rows)
+    add("Certificate", "certificate.json", _certified, certificate, policy)
+    add("Open loop", "open_loop.json", _predicted, run_dir, proof, images)
+    add("Training", "metrics.jsonl", _learned, run_dir, images)
+    command = dig(results, "config", "command")
+    config = {"command": command, **(policy.get("config") or {})}
     versions = policy.get("versions") or results.get("versions")
-    return [*sections, made_with(command | (policy.get("config") or {}), versions)]
+    return [*sections, made_with(config, versions)]
 
 
 def _scores(results: dict[str, Any]) -> list[Part]:
-    """The metrics of all systems: tables for each group that may be compared."""
+    """Return the metrics of all systems: tables for each group of comparable rows."""
     parts: list[Part] = []
     for group in grouped(results.get("rows") or [], SHARED):
         parts.append(f"{title_of(group, SHARED)}: {tables.amount(group)}")
@@ -144,15 +163,16 @@ def _scores(results: dict[str, Any]) -> list[Part]:
 
 
 def _driven(
-    run_dir: Path, half: Any, images: Path, rows: list[Row] | None
+    run_dir: Path, half_width: Any, images: Path, rows: list[Row] | None
 ) -> list[Part]:
-    """Figures of every group of episodes, and a film of the first one."""
+    """Draw figures of every group of episodes, and a film of the first group."""
     parts: list[Part] = []
-    corridor = float(half) if is_number(half) else None
-    for number, group in enumerate(by_road(of_rows(run_dir, rows or [])), 1):
+    corridor = float(half_width) if is_number(half_width) else None
+    groups = by_road(of_rows(run_dir, rows or []))
+    for number, group in enumerate(groups, 1):
         title = title_of([group[0].row], SHARED)
-        film = number == 1
-        parts += draw_episodes(group, images, title, number, corridor, film=film)
+        is_first = number == 1
+        parts += draw_episodes(group, images, title, number, corridor, film=is_first)
     return parts
 
 
@@ -165,67 +185,103 @@ def draw_episodes(
     *,
     film: bool = True,
 ) -> list[Part]:
-    """The first episode of every row of a group as a figure, and as a film."""
+    """Draw the first episode of every row of a group as a figure, and as a film.
+
+    Args:
+        group: of episodes on one road.
+        images: folder of the images.
+        title: what the rows have in common, in words.
+        number: of the group, for the names of the files.
+        corridor: half width of the certified corridor [m], or None.
+        film: whether to make a film.
+    """
     path = images / f"first_{number}.png"
     style.save(path, figures.first_episode, group, corridor)
     parts: list[Part] = [f"{title}.", Picture(path, f"First episode: {title}")]
-    made = film_of(images / f"film_{number}.gif", group, corridor) if film else None
-    return [*parts, Picture(made, f"Film: {title}")] if made else parts
+    if not film:
+        return parts
+    film_path = film_of(images / f"film_{number}.gif", group, corridor)
+    if film_path is not None:
+        parts.append(Picture(film_path, f"Film: {title}"))
+    return parts
 
 
 def _certified(record: dict[str, Any], policy: dict[str, Any]) -> list[Part]:
-    """What holds and on what it rests, then the boxes outside of which it does not."""
+    """Return what holds and on what it rests, then the boxes in which it holds."""
     if not record:
         return []
     if not holds(record):
         reason = plain(record.get("reason") or "the file gives no reason")
         return [f"No contraction is certified for these weights: {reason}."]
+    quantities = _certified_quantities(record)
+    parts: list[Part] = [
+        PROOF,
+        record_table("Quantity", quantities, "value", "rests on"),
+    ]
+    boxes = _certified_boxes(record, policy)
+    if boxes:
+        parts.append(record_table("Box", boxes, "from", "to"))
+    return parts
+
+
+def _certified_quantities(record: dict[str, Any]) -> dict[str, list[str]]:
+    """Return name -> [value, what it rests on] of what a certificate holds."""
     file = resources.files("sfkd_jax.report") / "templates" / "certificate.csv"
-    quantities, boxes = {}, {}
+    quantities = {}
     for line in file.read_text("utf-8").splitlines():
-        name, place, write, basis = line.split(";")
-        shown = _WRITERS[write](dig(record, *place.split(".")))
-        quantities |= {name: [shown, basis]} if DASH not in shown else {}
+        name, place, writer, basis = line.split(";")
+        shown = _WRITERS[writer](dig(record, *place.split(".")))
+        if DASH not in shown:
+            quantities[name] = [shown, basis]
+    return quantities
+
+
+def _certified_boxes(
+    record: dict[str, Any], policy: dict[str, Any]
+) -> dict[str, list[Any]]:
+    """Return name -> [lower, upper end] of the axes of the boxes of a certificate."""
+    boxes = {}
     for box, known in _axes(record, policy).items():
         # Boxes of logged data name their own axes.
-        for axis, name in enumerate(dig(record, "boxes", "names", box) or known):
-            side = [dig(record, "boxes", box, end, str(axis)) for end in "01"]
-            boxes |= {f"{box}: {name}": side} if is_pair(side) else {}
-    parts: list[Part] = [PROOF]
-    parts.append(record_table("Quantity", quantities, "value", "rests on"))
-    return [*parts, record_table("Box", boxes, "from", "to")] if boxes else parts
+        names = dig(record, "boxes", "names", box) or known
+        for axis, name in enumerate(names):
+            ends = [dig(record, "boxes", box, end, str(axis)) for end in ("0", "1")]
+            if is_pair(ends):
+                boxes[f"{box}: {name}"] = ends
+    return boxes
 
 
 def _axes(record: dict[str, Any], policy: dict[str, Any]) -> dict[str, list[str]]:
-    """Names of the axes of every box of a certificate, from the vehicle of a policy."""
+    """Return the names of the axes of every box, those of the vehicle of the policy."""
     settings = policy.get("config") or {}
     vehicle = settings.get("vehicle")
     if not vehicle:
         return {}
-    named = axes(
-        build_vehicle(vehicle),
-        # No other certificate has a corridor.
-        along_path=bool(record.get("corridor")),
-    )
+    # No certificate of another frame has a corridor.
+    named = axes(build_vehicle(vehicle), along_path=bool(record.get("corridor")))
     environment = dig(settings, "environment", "names")
     return named | ({"env": environment} if environment else {})
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
-    """Errors of predictions by time ahead, beside bicycles."""
+    """Draw errors of predictions by time ahead, beside those of simple models."""
     errors = read_optional(run_dir / "open_loop.json")
     if not errors.get("steps"):
         return []
     radii = dig(proof, "tube", "physical", "position_m")
     path = style.save(images / "open_loop.png", figures.open_loop, errors, radii or [])
-    words = f"{plain(errors.get('trajectories'))} trajectories that training never saw."
-    return [Picture(path, "Prediction error by time ahead"), words]
+    number = plain(errors.get("trajectories"))
+    return [
+        Picture(path, "Prediction error by time ahead"),
+        f"{number} trajectories that training never saw.",
+    ]
 
 
 def _learned(run_dir: Path, images: Path) -> list[Part]:
-    """The loss by optimisation step."""
+    """Draw the loss by optimisation step."""
     log = run_dir / "metrics.jsonl"
-    if not (log.exists() and (lines := store.read_jsonl(log))):
+    lines = store.read_jsonl(log) if log.exists() else []
+    if not lines:
         return []
     path = style.save(images / "learning.png", figures.learning, lines)
     return [Picture(path, "Loss by optimisation step")]
@@ -240,10 +296,15 @@ _FIGURE = ("vehicle", *_TABLE)
 def write_results_page(directory: Path) -> dict[str, Any]:
     """Write `directory/report/`: index.html, table1.tex, figures, films.
 
-    `directory` is that of a comparison, with results.json; the arrays of its rows may
-    be missing. Returns the paths of the page and of its images.
+    Args:
+        directory: of a comparison, with results.json; the arrays of its rows may be
+            missing.
+
+    Returns:
+        The paths of the page and of its images.
     """
-    source, home = directory / "results.json", directory / "report"
+    source = directory / "results.json"
+    home = directory / "report"
     with store.as_artefact_error(home), store.as_artefact_error(source, ValueError):
         results = store.read_json(source, keys=("rows",))
         images = empty_folder(home / "figures")
@@ -256,7 +317,10 @@ def write_results_page(directory: Path) -> dict[str, Any]:
 def _results(
     results: dict[str, Any], directory: Path, images: Path
 ) -> tuple[list[Section], list[tuple[str, pd.DataFrame]]]:
-    """Tables, figures, every metric, what made them; then tables with captions."""
+    """Return the sections of the page, and (caption, table) of the main tables.
+
+    The sections are tables, figures, every metric, and what made them.
+    """
     rows: list[Row] = results["rows"]
     first: list[Part] = [tables.MARKS, tables.amount(rows)]
     if failed := results.get("failed"):
@@ -267,29 +331,41 @@ def _results(
     if paper:
         printed = {style.label(name): numbers for name, numbers in paper.items()}
         first.append(record_table("Printed in the paper", printed, *heads))
-    sections, metrics, captions = [Section("", first)], [], []
+    sections = [Section("", first)]
+    metrics = []
+    captions = []
     for group in grouped(rows, _TABLE):
         # One table over all vehicles and scenarios: a group shares all that is left.
         title = title_of(group, _TABLE)
-        if (table := tables.cross_table(group, tables.rmse_cell)) is not None:
+        table = tables.cross_table(group, tables.rmse_cell)
+        if table is not None:
             sections.append(Section(title, [table]))
             captions.append((f"{title}. {tables.MARKS}", table))
         for metric in tables.shown_metrics():
-            if (table := tables.cross_table(group, metric.text)) is not None:
+            table = tables.cross_table(group, metric.text)
+            if table is not None:
                 head = f"{metric.head()}: {title}"
                 metrics.append(Section(head, [table], folded=True))
     for number, group in enumerate(grouped(rows, _FIGURE), 1):
         drawn = _drawn(group, directory, images, number)
         sections.append(Section(title_of(group, _FIGURE), drawn))
-    made = made_with(results.get("config") or {}, results.get("versions"))
-    return [*sections, *metrics, made], captions
+    config = results.get("config") or {}
+    sections = [*sections, *metrics, made_with(config, results.get("versions"))]
+    return sections, captions
 
 
 def _drawn(group: list[Row], directory: Path, images: Path, number: int) -> list[Part]:
-    """The paper's figures 1 and 2 and a film, of the last scenario that has them."""
+    """Draw the paper's figures 1 and 2 and a film.
+
+    Figure 1 and the film are of the last scenario of which episodes are stored, figure
+    2 is of the last scenario.
+    """
     scenarios = grouped(group, ("scenario",))
-    found = (of_rows(directory, rows) for rows in reversed(scenarios))
-    episodes = next((one for one in found if one), [])
+    episodes: list[Episodes] = []
+    for rows in reversed(scenarios):
+        episodes = of_rows(directory, rows)
+        if episodes:
+            break
     parts: list[Part] = []
     if episodes:
         title = title_of([episodes[0].row], ("scenario", *_FIGURE))

@@ -11,21 +11,34 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-ACCENT, SECOND, THIRD, MUTED = "#0b57b0", "#e8a33d", "#009e73", "#6b7280"
-DARK, SOFT, AXIS = "#30363d", "#57606a", "#9aa1ab"
+ACCENT = "#0b57b0"
+SECOND = "#e8a33d"
+THIRD = "#009e73"
+MUTED = "#6b7280"
+DARK = "#30363d"
+SOFT = "#57606a"
+AXIS = "#9aa1ab"
 BAND: dict[str, Any] = dict(fc=ACCENT, alpha=0.16, linewidth=0, zorder=0.5)
+"""Look of the area of a certified corridor."""
 EDGE: dict[str, Any] = dict(color=ACCENT, linewidth=1.0, zorder=2)
-"""Of a certified corridor."""
+"""Look of the edge of a certified corridor."""
 SWITCH: dict[str, Any] = dict(color=MUTED, ls=(0, (4, 3)), linewidth=0.9, zorder=1)
-"""Line at a switch of the environment, or at a level."""
+"""Look of a line at a switch of the environment, or at a level."""
 WIDTH = 6.9
-"""Of every figure [in]: text of 10 pt stays legible at the width of a phone."""
+"""Width of every figure [in]: text of 10 pt stays legible at the width of a phone."""
 STYLE = Path(__file__).parent / "templates" / "figures.mplstyle"
 """Settings of matplotlib beyond its defaults."""
 
 
 class Look(NamedTuple):
-    """Label, colour, dashes (on, off, …; none for a solid line), width of a line."""
+    """How the line of a system is drawn.
+
+    Attributes:
+        label: in legends.
+        colour: of the line.
+        dashes: lengths (on, off, …) [line widths]; () for a solid line.
+        width: of the line [pt].
+    """
 
     label: str
     colour: str
@@ -33,7 +46,10 @@ class Look(NamedTuple):
     width: float = 1.3
 
 
-_PART, _RIVAL = (4, 1.5), (5, 1, 1, 1)
+_PART = (4, 1.5)
+"""Dashes of a model without one of its parts."""
+_RIVAL = (5, 1, 1, 1)
+"""Dashes of a model of others."""
 # The colours are safe for colour-blind readers (after Okabe and Ito, and Tol), and
 # dashes tell apart what colours alone do not.
 SYSTEMS = {
@@ -66,23 +82,25 @@ SYSTEMS = {
 
 
 def family(system: str) -> str:
-    """The name of a system without its coordinates."""
+    """Return the name of a system without its coordinates."""
     return system.replace("_path", "")
 
 
 def rank(system: str) -> tuple[int, str]:
-    """Sort key for the order of every table; unknown systems come last."""
-    order, name = [*SYSTEMS], family(system)
-    return (order.index(name) if name in order else len(order), system)
+    """Return the sort key of every table; unknown systems come last."""
+    order = [*SYSTEMS]
+    name = family(system)
+    position = order.index(name) if name in order else len(order)
+    return position, system
 
 
 def label(system: str) -> str:
-    """The label of a system; an unknown one is its own label."""
+    """Return the label of a system; an unknown one is labelled with its name."""
     return SYSTEMS.get(family(system), Look(system, MUTED)).label
 
 
 def scenario_label(name: str) -> str:
-    """The label of a scenario: s3 is S3, other names are unchanged."""
+    """Return the label of a scenario: s3 is S3, other names are unchanged."""
     return name.upper() if re.fullmatch(r"s\d+", name) else name
 
 
@@ -92,7 +110,12 @@ def literal(text: str) -> str:
 
 
 def line(system: str, name: str | None = None) -> dict[str, Any]:
-    """Keyword arguments of the line of a system, labelled with a name or its own."""
+    """Return the keyword arguments of the line of a system.
+
+    Args:
+        system: name of the system.
+        name: label in place of that of the system.
+    """
     look = SYSTEMS.get(family(system), Look(system, MUTED, (1, 1), 1.2))
     return {
         "label": literal(name or look.label),
@@ -105,7 +128,7 @@ def line(system: str, name: str | None = None) -> dict[str, Any]:
 
 
 def canvas(height: float) -> Figure:
-    """An empty figure, WIDTH x `height` [in], that no global state refers to."""
+    """Return an empty figure, WIDTH x `height` [in], that no global state refers to."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
@@ -115,7 +138,7 @@ def legend(figure: Figure, axes: Any, title: str | None = None) -> None:
     """Put one legend above the whole figure, which grows by the rows of the legend."""
     handles, labels = axes.get_legend_handles_labels()
     # Long names take the room of a column.
-    columns = 3 if any(len(one) > 20 for one in labels) else 4
+    columns = 3 if any(len(label) > 20 for label in labels) else 4
     columns = min(columns, max(1, len(labels)))
     where = "outside upper left"
     figure.legend(

@@ -226,19 +226,20 @@ class Planner(Stateful):
             tuning=tuning._replace(elapsed=jnp.ones_like(tuning.elapsed)),
         )
         env_inside = jnp.asarray(True) if inside is env else jnp.all(inside == env)
-        info: ControllerInfo = {
+        info: Any = {
             "cost": result.cost,
             "mean_cost": chosen.cost,
             "effective_samples": result.effective_samples,
             "healthy": healthy & setup.followable,
             "env_inside": env_inside,
             "predicted_states": chosen.states,
+            **chosen.constraint_info(),
         }
         if precise is not None:
             # A coarse plan is driven, not replaced: it is better than the last one.
             info["precision"] = precise
             info["healthy"] = info["healthy"] & precise
-        return control, after, {**info, **chosen.constraint_info()}
+        return control, after, info
 
     def _nearest(self, env: Any) -> Any:
         """Return the environment, clipped to its box if there is one."""

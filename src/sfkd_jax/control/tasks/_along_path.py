@@ -1,4 +1,4 @@
-"""Driving along a path: one projection a control step, and the task of following it.
+"""Driving along a path: the projection of each step, and the task of following a law.
 
 A controller along a path is a `Controller` whose observation is ξ and whose reference
 is a `Preview`. `along_reference` turns it into one that sees poses in the world.
@@ -25,6 +25,7 @@ from sfkd_jax.control.tasks._task import (
     Sample,
     StepIndex,
     StepResult,
+    Task,
 )
 from sfkd_jax.geometry import (
     HEADING,
@@ -33,14 +34,13 @@ from sfkd_jax.geometry import (
     PathState,
     beside,
     between,
-    compose,
     curvature_ahead,
     entrywise,
     followable,
     path_coordinates,
     path_state,
 )
-from sfkd_jax.rollout import Offset, fold
+from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
     POSE,
@@ -57,19 +57,28 @@ from sfkd_jax.types import (
 
 
 class Preview(NamedTuple):
-    """The road ahead, as controllers along a path see it."""
+    """The road ahead, as controllers along a path see it.
 
-    # κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not finite.
+    Attributes:
+        road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
+            finite.
+        along: distance along the path from the first point of the reference to the
+            observed position [m]; behind a `Gate`, to the last position that was
+            believed.
+        repeated: whether the observation is bit for bit the last one, like that of a
+            sensor that froze.
+        measured: which entries of ξ are measured; behind a `Gate` the others are
+            predicted.
+        on_time: whether the last call was one period ago.
+        trusted: whether the certificate may be claimed, see `Gate`.
+    """
+
     road: Float[Array, "horizon 2"]
-    # Distance of the observed position from the first point of the reference, along the
-    # path [m]; behind a `Gate` of the last one that was believed.
     along: Scalar
-    # Whether the observation is bit for bit the last one, as of a sensor that freezes.
     repeated: Bool[Array, ""]
-    # Which entries of ξ are measured; behind a `Gate` the others are predicted.
     measured: Bool[Array, " coordinate"]
-    on_time: Bool[Array, ""]  # whether the last call was one period ago
-    trusted: Bool[Array, ""]  # whether the certificate may be claimed, see `Gate`
+    on_time: Bool[Array, ""]
+    trusted: Bool[Array, ""]
 
 
 class AlongReferenceState(NamedTuple):
@@ -83,15 +92,16 @@ class AlongReferenceState(NamedTuple):
 class AlongReference(Stateful):
     """A controller in the world from one along a path.
 
-    The only place where a state is projected, once per control step. Predicted states
-    are mapped back beside the reference points.
+    This is the only place where a state is projected onto the path, once per control
+    step. Predicted states are mapped back beside the points of the reference.
+
+    `info` gains `path_state` (ξ; NaN if observation or reference are not finite),
+    `road` (κ and v_ref of this step; NaN likewise), `planned_path` (predicted ξ) and
+    `precision` (whether the type of the positions resolves them).
 
     Attributes:
-        inner: `act` takes ξ and a `Preview` in place of observation and reference.
+        inner: its `act` takes ξ and a `Preview` in place of observation and reference.
         coordinates: size of ξ.
-
-    `info` gains `path_state` (ξ, NaN where observation or reference are not finite),
-        `road` (κ and v_ref of this step, likewise) and `planned_path` (predicted ξ).
     """
 
     inner: Controller
@@ -100,7 +110,7 @@ class AlongReference(Stateful):
 
     def init(self, key: Key) -> AlongReferenceState:
         """Return the state before the first control step."""
-        # NaN equals nothing, so that the first observation is never a repetition.
+        # NaN equals nothing, so the first observation is never a repetition.
         unknown = jnp.full(self.coordinates + 1, jnp.nan, dtype=float)
         return AlongReferenceState(self.inner.init(key), unknown)
 
@@ -114,12 +124,12 @@ class AlongReference(Stateful):
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
         """Take one control step."""
         precise = check_path(observation, env, reference, reference.shape[0])
-        reference, known = followable(reference)
+        reference, is_followable = followable(reference)
         curvature = curvature_ahead(reference)
         xi = path_coordinates(observation, reference[0], curvature[0])
         road = jnp.stack([curvature, reference[:, 3]], axis=1)
-        # A position that is not finite can leave κ finite (points "coincide"); what
-        # cannot be trusted as a whole is NaN as a whole.
+        # κ can be finite where a position is not, because such points count as one.
+        # A reference that cannot be trusted as a whole is NaN as a whole.
         readable = all_finite(reference)
         road = jnp.where(readable, road, jnp.nan)
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
@@ -130,17 +140,22 @@ class AlongReference(Stateful):
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
-            trusted=precise & known,
+            trusted=precise & is_followable,
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info["predicted_states"]
-        # A gate has already said which of ξ is believed.
-        info: Any = {"path_state": xi, **info, "planned_path": planned}
-        info |= {"precision": precise, "road": road[0]}
-        if "healthy" in info:
-            info["healthy"] &= precise & known
-        info["predicted_states"] = jax.vmap(beside)(planned, reference)
-        return control, AlongReferenceState(inner, observation), info
+        report: Any = {
+            "path_state": xi,
+            # A gate inside has already said which entries of ξ are believed.
+            **info,
+            "planned_path": planned,
+            "predicted_states": jax.vmap(beside)(planned, reference),
+            "precision": precise,
+            "road": road[0],
+        }
+        if "healthy" in report:
+            report["healthy"] &= precise & is_followable
+        return control, AlongReferenceState(inner, observation), report
 
 
 along_reference = factory(AlongReference, AlongReference.controller)
@@ -148,11 +163,17 @@ along_reference = factory(AlongReference, AlongReference.controller)
 
 
 class AlongTarget(NamedTuple):
-    """What all samples share of one step."""
+    """What all samples share of one step.
 
-    road: Float[Array, "*horizon 2"]  # κ [1/m] and v_ref [m/s]
-    turn: SteadyTurn  # of the law
-    fiber: Any  # of the model on this road; None: that of all steps
+    Attributes:
+        road: κ [1/m] and v_ref [m/s].
+        turn: of the law on this road.
+        fiber: of the model on this road; None if it is that of all steps.
+    """
+
+    road: Float[Array, "*horizon 2"]
+    turn: SteadyTurn
+    fiber: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +188,8 @@ class FollowingLaw(LawTask):
     `law.perturbation`, as it did in the training data.
 
     Attributes:
-        law: the one that the model was learned around. All others are those of
-            `LawTask`, the model in path coordinates.
+        law: around which the model was learned. The other attributes are those of
+            `LawTask`, with a model in path coordinates.
     """
 
     law: PathLaw
@@ -189,19 +210,21 @@ class FollowingLaw(LawTask):
         preview: Preview,
         previous: PlanningStart,
     ) -> RolloutSetup:
-        """Return fibre, start, law and targets, evaluated once per control step."""
+        """Return what is evaluated once per control step: fibre, start and targets."""
         fiber = self.model.fiber(fold(self.model, params), env)
         turns = jax.vmap(self.law.turn, in_axes=(0, 0, None))(
             preview.road[:, 0], preview.road[:, 1], env
         )
-        first = jax.tree.map(lambda leaf: leaf[0], turns)
-        law_control = jnp.clip(first.feedback(coordinates), *self.box())
+        first_turn = jax.tree.map(lambda leaf: leaf[0], turns)
+        low, high = self.box()
+        law_control = jnp.clip(first_turn.feedback(coordinates), low, high)
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
         latent = self.model.encode(fiber, path_state(coordinates))
         start = Sample(latent, coordinates, before)
-        on_road = self.model.on_road
-        fibers = on_road and jax.vmap(partial(on_road, fiber))(preview.road)
+        fibers = None
+        if self.model.on_road is not None:
+            fibers = jax.vmap(partial(self.model.on_road, fiber))(preview.road)
         return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
 
     def step(
@@ -215,32 +238,32 @@ class FollowingLaw(LawTask):
     ) -> StepResult:
         """Return one step of one rollout: law, perturbation, limits, model."""
         law_control = target.turn.feedback(before.state)
-        most = jnp.asarray(self.law.perturbation)
-        nu = entrywise(jnp.clip, nu, -most, most)
+        largest = jnp.asarray(self.law.perturbation)
+        nu = entrywise(jnp.clip, nu, -largest, largest)
         control = self.limit(law_control + nu, before.control)
-        # What the limits left of ν: the model was learned on what really acted.
+        # The model was learned on the perturbations that really acted.
         effective = control - law_control
         inputs = jnp.concatenate([effective, target.road])
-        here = fiber if target.fiber is None else target.fiber
-        latent = self.model.step(here, before.latent, inputs)
+        road_fiber = fiber if target.fiber is None else target.fiber
+        latent = self.model.step(road_fiber, before.latent, inputs)
         coordinates = self.model.decode(fiber, latent)[BODY]
-        sample = Sample(latent, coordinates, control)
-        return StepResult(sample, control, effective, coordinates)
+        return StepResult(
+            sample=Sample(latent, coordinates, control),
+            control=control,
+            perturbation=effective,
+            state=coordinates,
+        )
 
     def errors(
         self, before: Sample, after: Sample, target: AlongTarget
     ) -> tuple[PathErrors, PathErrors, Scalar]:
         """Return the errors before and after a step, and the speed of the reference."""
         speed = target.road[1]
-        errors_before, errors = (
-            PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
-            for xi in (before.state, after.state)
-        )
-        return errors_before, errors, speed
 
+        def errors_of(xi: PathState) -> PathErrors:
+            return PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
 
-following_law = factory(FollowingLaw, lambda around: around.task(check_preview))
-"""(model, cost, law, settings of `FollowingLaw`) -> `Task`."""
+        return errors_of(before.state), errors_of(after.state), speed
 
 
 def check_preview(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
@@ -257,92 +280,10 @@ def check_preview(coordinates: Any, env: Any, preview: Any, horizon: int) -> Non
         )
 
 
-class Request(NamedTuple):
-    """State of a planner in the world, and what the world around it is."""
-
-    inner: Any
-    observation: State
-    reference: Reference
+def _task(settings: FollowingLaw) -> Task:
+    """Return the task of following a law, which checks previews."""
+    return settings.task(check_preview)
 
 
-PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
-"""Entries of `info` that a planner alone can give."""
-ABOUT = "about"
-"""Entry of `info` that holds the planner's own on its way out of the guard."""
-
-
-def requesting(planner: Controller, horizon: int, coordinates: int) -> Controller:
-    """Return a planner in the world as one along a path, see `behind`.
-
-    It observes what the caller does, bit for bit, where all of ξ is measured, and
-    elsewhere the state that a gate believes.
-
-    Args:
-        planner: any.
-        horizon: number of steps of the reference.
-        coordinates: size of ξ.
-    """
-
-    def init(key: Key) -> Request:
-        nothing = jnp.zeros(coordinates + 1), jnp.zeros((horizon, 4))
-        return Request(planner.init(key), *nothing)
-
-    def act(
-        params: Params, state: Request, xi: PathState, env: Any, preview: Preview
-    ) -> tuple[Control, Request, ControllerInfo]:
-        bend = preview.road[0, 0]
-        along = preview.along
-        left = xi[LATERAL] + 0.5 * bend * along**2
-        motion = jnp.stack([along, left, xi[HEADING] + bend * along])
-        pose = compose(state.reference[0, POSE], motion)
-        believed = jnp.concatenate([pose, xi[PATH_SPEED:]])
-        seen = jnp.where(jnp.all(preview.measured), state.observation, believed)
-        # What an adaptation adds to the model is not that of another planner.
-        own = params.params if isinstance(params, Offset) else params
-        planned, memory, about = planner.act(
-            own, state.inner, seen, env, state.reference
-        )
-        planned = jnp.asarray(planned, dtype=float)
-        if planned.shape != (2,):
-            raise ValueError(f"a planner's control has shape (2,), got {planned.shape}")
-        unknown = jnp.asarray(jnp.nan, dtype=float)
-        info: Any = {
-            **dict.fromkeys(PLANNED, unknown),
-            "healthy": all_finite(planned) & about.get("healthy", True),
-            "env_inside": jnp.asarray(True),
-            "predicted_states": jnp.full((horizon, coordinates), unknown),
-            ABOUT: about,
-        }
-        return planned, state._replace(inner=memory), info
-
-    return Controller(init, act)
-
-
-def behind(guard: Controller) -> Controller:
-    """Return a guard in the world around a planner that is `requesting`, at any depth.
-
-    What the projection loses travels in the state, past whatever wrapper is between;
-    entries of the planner's `info` appear in that of the guard.
-    """
-
-    def act(
-        params: Params, state: Any, observation: Any, env: Any, reference: Any
-    ) -> tuple[Control, Any, ControllerInfo]:
-        world = {"observation": observation, "reference": reference}
-        shown = jax.tree.map(
-            lambda node: node._replace(**world) if _is_request(node) else node,
-            state,
-            is_leaf=_is_request,
-        )
-        info: Any
-        control, after, info = guard.act(params, shown, observation, env, reference)
-        about = info.pop(ABOUT)
-        known = {name: about[name] for name in PLANNED if name in about}
-        merged: Any = {**about, **info, **known}
-        return control, after, merged
-
-    return Controller(guard.init, act)
-
-
-def _is_request(node: Any) -> bool:
-    return isinstance(node, Request)
+following_law = factory(FollowingLaw, _task)
+"""(model, cost, law, settings of `FollowingLaw`) -> `Task`."""

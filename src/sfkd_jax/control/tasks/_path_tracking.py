@@ -64,7 +64,7 @@ class StageInputs(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """A stage cost whose weights are data: changing them does not recompile anything.
+    """A stage cost whose weights are data, so a change compiles nothing again.
 
     Attributes:
         weights: a pytree of numbers.
@@ -90,8 +90,8 @@ def tracking_cost(
         ℓ = q_y e_y² + q_c (Δe_y / v dt)² + q_v (s e_v)² + q_δ̇ (Δδ / dt)² + q_a a²
 
     The course error Δe_y / (v dt) is the direction of travel relative to the path. A
-    vehicle that crabs in a side wind or through a bend then aligns its direction of
-    travel with the path, not its body heading. s is 1, or 5 m/s / v_ref below 5 m/s.
+    vehicle that slips sideways in wind or through a bend then aligns its direction of
+    travel with the path, not its heading. s is 1, or 5 m/s / v_ref below 5 m/s.
 
     Args:
         dt: sampling period [s].
@@ -113,32 +113,38 @@ def tracking_cost(
     def stage(weights: Mapping[str, Any], inputs: StageInputs) -> Scalar:
         errors = inputs.errors
         before = inputs.errors_before
-        # Finite at standstill.
+        # The small length keeps the angle finite at standstill.
         travelled = jnp.maximum(inputs.speed, CREEP) * dt + 1e-3
         angle = (errors.lateral - before.lateral) / travelled
         rate = (inputs.control[0] - inputs.control_before[0]) / dt
         total = weights["lateral"] * errors.lateral**2 + weights["course"] * angle**2
-        # Relative to a low speed, or standing beside the path would be cheap.
-        slow = SLOW_STEERING / jnp.maximum(inputs.speed, CREEP)
-        slow = jnp.where(inputs.speed > 0.0, jnp.maximum(slow, 1.0), 1.0)
-        total = total + weights["speed"] * (slow * errors.speed) ** 2
+        # A speed error counts relative to a low speed, or it would be cheap to stand
+        # beside the path.
+        scale = SLOW_STEERING / jnp.maximum(inputs.speed, CREEP)
+        scale = jnp.where(inputs.speed > 0.0, jnp.maximum(scale, 1.0), 1.0)
+        total = total + weights["speed"] * (scale * errors.speed) ** 2
         total = total + weights["steering_rate"] * rate**2
-        return (
-            total if speed_loop else total + weights["effort"] * inputs.control[1] ** 2
-        )
+        if speed_loop:
+            return total
+        return total + weights["effort"] * inputs.control[1] ** 2
 
     return Cost(weights, stage)
 
 
 class PathTarget(NamedTuple):
-    """The reference of one step."""
+    """The reference of one step.
 
-    point: Float[Array, "*horizon 4"]  # x, y, yaw, speed
-    curvature: Float[Array, "*horizon"]  # of the path there [1/m]
+    Attributes:
+        point: x [m], y [m], yaw [rad], speed [m/s].
+        curvature: of the path there [1/m].
+    """
+
+    point: Float[Array, "*horizon 4"]
+    curvature: Float[Array, "*horizon"]
 
 
 class PathTargets(NamedTuple):
-    """The references of a step and of the one before; of the first step twice."""
+    """The references of a step and of the step before; for the first step the same."""
 
     before: PathTarget
     now: PathTarget
@@ -146,7 +152,7 @@ class PathTargets(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LawTask:
-    """A task of following a path around a feedback law; a subclass rolls it out.
+    """A task of following a path around a feedback law; a subclass defines its steps.
 
     Attributes:
         model: rolled out; `fiber` and `encode` are evaluated once per control step,
@@ -174,10 +180,19 @@ class LawTask:
         _ = self.limit
 
     def task(self, check: Callable[..., Any]) -> Task:
-        """Return the planning problem as functions, of which `check` is the last."""
-        own: Any = self
-        steps = own.prepare, own.step, check, self.charge
-        return Task(*self.box(), self.cost.weights, *steps)
+        """Return the planning problem as functions, with `check` for its arguments."""
+        # A subclass defines `prepare` and `step`.
+        subclass: Any = self
+        low, high = self.box()
+        return Task(
+            low=low,
+            high=high,
+            weights=self.cost.weights,
+            prepare=subclass.prepare,
+            step=subclass.step,
+            check=check,
+            cost=self.charge,
+        )
 
     def errors(
         self, before: Sample, after: Sample, target: Any
@@ -190,16 +205,21 @@ class LawTask:
     ) -> Scalar:
         """Return the cost of one step."""
         errors_before, errors, speed = self.errors(before, after, target)
-        controls = after.control, before.control
-        stage = StageInputs(errors, errors_before, *controls, speed)
-        cost = self.cost.stage(weights, stage)
+        inputs = StageInputs(
+            errors=errors,
+            errors_before=errors_before,
+            control=after.control,
+            control_before=before.control,
+            speed=speed,
+        )
+        cost = self.cost.stage(weights, inputs)
         return cost * (1.0 + self.terminal_weight * at.last)
 
     def box(self) -> tuple[Control, Control]:
         """Return the lower and upper control limits."""
-        low = self.control_low
-        high = self.control_high
-        return jnp.asarray(low, dtype=float), jnp.asarray(high, dtype=float)
+        low = jnp.asarray(self.control_low, dtype=float)
+        high = jnp.asarray(self.control_high, dtype=float)
+        return low, high
 
     @cached_property
     def limit(self) -> Limiter:
@@ -217,8 +237,8 @@ class PathTracking(LawTask):
         J = Σ_k ℓ(x_k, u_k) + w_T ℓ(x_T, u_T)
 
     Attributes:
-        law: u_ff + K ξ; see `path_feedback` and `no_feedback`. All others are those of
-            `LawTask`.
+        law: u_ff + K ξ; see `path_feedback` and `no_feedback`. The other attributes are
+            those of `LawTask`.
     """
 
     law: FeedbackLaw
@@ -231,15 +251,19 @@ class PathTracking(LawTask):
         reference: Reference,
         previous: PlanningStart,
     ) -> RolloutSetup:
-        """Return fibre, start, law and targets, evaluated once per control step."""
+        """Return what is evaluated once per control step: fibre, start and targets."""
         model = self.model
-        reference, known = followable(reference)
+        reference, is_followable = followable(reference)
         # Many rollouts share this fibre; folding parameters that are folded is free.
         fiber = model.fiber(fold(model, params), env)
         curvature = reference_curvature(reference)
         now = PathTarget(reference, curvature)
-        earlier = jax.tree.map(lambda leaf: jnp.append(leaf[:1], leaf[:-1], 0), now)
-        first = jax.tree.map(lambda leaf: leaf[0], now)
+
+        def one_step_before(leaf: Array) -> Array:
+            return jnp.append(leaf[:1], leaf[:-1], 0)
+
+        earlier = jax.tree.map(one_step_before, now)
+        first = PathTarget(reference[0], curvature[0])
         law_control, _ = self._law_control(observation, first)
         # At the first step no control is known: assume that the law has driven.
         before = jnp.where(previous.known, previous.control, law_control)
@@ -247,8 +271,12 @@ class PathTracking(LawTask):
         # Few models are right at walking pace: there the law sees the measurement.
         slow = observation[3] < SLOW_STEERING
         state = jnp.where(slow, observation, model.decode(fiber, latent))
-        start = Sample(latent, state, before)
-        return RolloutSetup(fiber, start, PathTargets(earlier, now), known)
+        return RolloutSetup(
+            context=fiber,
+            start=Sample(latent, state, before),
+            targets=PathTargets(earlier, now),
+            followable=is_followable,
+        )
 
     def step(
         self,
@@ -267,37 +295,37 @@ class PathTracking(LawTask):
         control = self.limit(law_control + nu, before.control)
         latent = model.step(fiber, before.latent, control)
         after = model.decode(fiber, latent)
-        sample = Sample(latent, after, control)
-        return StepResult(sample, control, control - law_control, after)
+        return StepResult(
+            sample=Sample(latent, after, control),
+            control=control,
+            perturbation=control - law_control,
+            state=after,
+        )
 
     def errors(
         self, before: Sample, after: Sample, target: PathTargets
     ) -> tuple[PathErrors, PathErrors, Scalar]:
         """Return the errors before and after a step, and the speed of the reference."""
         earlier, now = target
-        errors_before = path_errors(before.state, *earlier)
-        return errors_before, path_errors(after.state, *now), now.point[3]
+        errors_before = path_errors(before.state, earlier.point, earlier.curvature)
+        errors = path_errors(after.state, now.point, now.curvature)
+        return errors_before, errors, now.point[3]
 
     def _law_control(self, state: State, target: PathTarget) -> tuple[Control, Scalar]:
-        """The control of the law, clipped to the limits, and its planner's authority.
+        """Return the clipped control of the law, and the share of ν that acts.
 
         Without the clip, a perturbation would compensate for what the law requests
         beyond the limits. After a far-off observation that is thousands of radians, and
         it would stay in the plan when the observations are right again.
         """
-        point = target.point
-        curvature = target.curvature
-        law = self.law
-        errors = path_errors(state, point, curvature)
+        speed = target.point[3]
+        errors = path_errors(state, target.point, target.curvature)
         authority = jnp.ones(())
-        control = law(errors, curvature, point[3])
-        if isinstance(law, RecoveringFeedback):
-            authority = law.authority(errors, point[3])
-        return entrywise(jnp.clip, control, *self.box()), authority
-
-
-path_tracking = factory(PathTracking, lambda around: around.task(check_path))
-"""(model, cost, law, settings of `PathTracking`) -> `Task`."""
+        control = self.law(errors, target.curvature, speed)
+        if isinstance(self.law, RecoveringFeedback):
+            authority = self.law.authority(errors, speed)
+        low, high = self.box()
+        return entrywise(jnp.clip, control, low, high), authority
 
 
 def check_path(
@@ -317,3 +345,12 @@ def check_path(
             f"got {reference.shape}"
         )
     return is_precise(observation, reference)
+
+
+def _task(settings: PathTracking) -> Task:
+    """Return the task of tracking a path, which checks its arguments."""
+    return settings.task(check_path)
+
+
+path_tracking = factory(PathTracking, _task)
+"""(model, cost, law, settings of `PathTracking`) -> `Task`."""

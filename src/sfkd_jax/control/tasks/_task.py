@@ -1,4 +1,4 @@
-"""Planning problems: pure functions of a rollout step, with any cost or constraint."""
+"""Planning problems as pure functions of a step, with any cost and any constraint."""
 
 from __future__ import annotations
 
@@ -29,14 +29,24 @@ Constraint: TypeAlias = Callable[[Any, Any, Control, Any, "StepIndex"], Violatio
 
 
 class PlanningStart(NamedTuple):
-    """The control applied last, and whether there was one: False at the first step."""
+    """What a plan starts from.
+
+    Attributes:
+        control: that was applied last.
+        known: whether there was one; False at the first step.
+    """
 
     control: Control
     known: Bool[Array, ""]
 
 
 class StepIndex(NamedTuple):
-    """The number of a step: 0, 1, …; and 1 at the last one, 0 before it."""
+    """The place of a step in the horizon.
+
+    Attributes:
+        number: 0, 1, ….
+        last: 1 at the last step, 0 before it.
+    """
 
     number: Int[Array, ""]
     last: Scalar
@@ -50,8 +60,8 @@ class RolloutSetup(NamedTuple):
         start: state of one rollout before its first step; a `Sample` if the task has a
             `cost`.
         targets: data of each step; every leaf has the horizon as its leading axis.
-        followable: whether the plan is for the reference that was given; if not, the
-            control is what the task does instead, and not healthy.
+        followable: whether the plan is for the reference of the caller. If it is not,
+            the task does something else instead, and the control is not healthy.
     """
 
     context: Any
@@ -64,9 +74,9 @@ class Sample(NamedTuple):
     """State of one rollout.
 
     Attributes:
-        latent: of the model; () where that is the state.
-        state: predicted last.
-        control: applied last.
+        latent: of the model; () if the state is its own latent.
+        state: that was predicted last.
+        control: that was applied last.
     """
 
     latent: Any
@@ -79,10 +89,10 @@ class StepResult(NamedTuple):
 
     Attributes:
         sample: state of the rollout after the step.
-        control: applied in the step.
+        control: that was applied in the step.
         perturbation: the part of the row of the plan that the limits allowed.
-        state: predicted state after the step; reported, not carried.
-        cost: of the step; None where `Task.cost` gives it.
+        state: predicted state after the step; it is reported, not carried on.
+        cost: of the step; None if `Task.cost` gives it.
     """
 
     sample: Any
@@ -95,7 +105,7 @@ class StepResult(NamedTuple):
 class Task(NamedTuple):
     """A planning problem as pure functions of one sample; planners vmap them.
 
-    A step takes one row of the plan. What a row means is up to the task: a control, a
+    A step takes one row of the plan. The task decides what a row means: a control, a
     perturbation of a feedback law, or, with `horizon=1`, the parameters of a whole
     manoeuvre, which `step` evaluates at once and returns as `state`.
 
@@ -109,10 +119,11 @@ class Task(NamedTuple):
             precise, or None where there are none; raises a ValueError that
             names an argument of the wrong shape.
         cost: (weights, sample before, sample after, target, step index) -> cost of a
-            step, from samples without latents. Short states are charged for all steps
-            at once, which is faster than in `step`; None if `step` gives it.
+            step, from samples without latents; None if `step` gives it. For short
+            states it is evaluated for all steps at once, which is faster than in
+            `step`.
         constraint: see `constrained`; None for no constraint.
-        constraint_data: that the constraint is given.
+        constraint_data: first argument of the constraint.
     """
 
     low: Control
@@ -143,20 +154,25 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
     rate = np.inf if rate is None else rate
     if np.shape(rate) not in ((), np.shape(low)) or not np.all(np.greater(rate, 0)):
         raise ValueError(f"control_rate needs positive numbers, got {rate}")
-    ends = low, high, dt * np.asarray(rate, float)
-    bottom, top, most = (jnp.asarray(end, dtype=float) for end in ends)
+    lowest = jnp.asarray(low, dtype=float)
+    highest = jnp.asarray(high, dtype=float)
+    largest_change = jnp.asarray(dt * np.asarray(rate, float), dtype=float)
 
-    def entry(wanted: Scalar, before: Scalar, *ends: Scalar) -> Scalar:
-        bottom, top, most = ends
+    def limit_entry(
+        wanted: Scalar, before: Scalar, lowest: Scalar, highest: Scalar, change: Scalar
+    ) -> Scalar:
         # An actuator outside its box returns to it at once, whatever its slew limit.
-        before = jnp.clip(before, bottom, top)
-        low = before - most
-        high = before + most
-        return jnp.clip(wanted, jnp.maximum(bottom, low), jnp.minimum(top, high))
+        before = jnp.clip(before, lowest, highest)
+        low = jnp.maximum(lowest, before - change)
+        high = jnp.minimum(highest, before + change)
+        return jnp.clip(wanted, low, high)
 
     def limit(wanted: Control, before: Control) -> Control:
-        ends = (jnp.broadcast_to(end, wanted.shape) for end in (bottom, top, most))
-        return entrywise(entry, wanted, before, *ends)
+        limits = [
+            jnp.broadcast_to(end, wanted.shape)
+            for end in (lowest, highest, largest_change)
+        ]
+        return entrywise(limit_entry, wanted, before, *limits)
 
     return limit
 
@@ -164,17 +180,18 @@ def actuator_limits(low: Limit, high: Limit, rate: Limit | None, dt: float) -> L
 def constrained(task: Task, constraint: Constraint, data: Any = ()) -> Task:
     """Return a task whose plans must keep constraints at every step.
 
-    A planner drops the samples that violate one, as long as any sample keeps all. If
-    none does, it takes the samples with the smallest violations, whatever they cost. If
-    the chosen mean of samples violates a constraint that single samples keep, the best
-    of those replaces it.
+    As long as any sample keeps all constraints, a planner drops the samples that
+    violate one. If none does, it takes the samples with the smallest violations,
+    whatever they cost. If the chosen mean of samples violates a constraint that single
+    samples keep, the best of those samples replaces the mean.
 
     Args:
         task: any task.
-        constraint: see `Constraint`; `outside_circles` and `outside_boxes` help.
-        data: pytree of numbers that the constraint is given: positions of obstacles,
-            margins. A planner carries it in `Tuning.constraints`, where it may change
-            at every control step.
+        constraint: see `Constraint`; `outside_circles` and `outside_boxes` help to
+            write one.
+        data: pytree of numbers that the constraint reads, such as positions of
+            obstacles and margins. A planner carries it in `Tuning.constraints`, where
+            it may change at every control step.
     """
     return task._replace(constraint=constraint, constraint_data=data)
 
@@ -189,10 +206,10 @@ def outside_circles(
     Args:
         position: x, y [m].
         circles: x, y, radius of each [m].
-        margin: by which each is enlarged [m].
+        margin: by which each circle is enlarged [m].
     """
     away = position - circles[:, :2]
-    # Finite derivatives in the centre too.
+    # The small number keeps derivatives finite in the centre.
     return circles[:, 2] + margin - jnp.sqrt(jnp.sum(away**2, axis=1) + 1e-12)
 
 
@@ -205,8 +222,8 @@ def outside_boxes(
 
     Args:
         position: x, y [m].
-        boxes: x, y of the centre, yaw [rad], length, width [m] of each.
-        margin: by which each is enlarged, with round corners [m].
+        boxes: x, y of the centre [m], yaw [rad], length, width [m] of each.
+        margin: by which each rectangle is enlarged, with round corners [m].
     """
     away = position - boxes[:, :2]
     cos = jnp.cos(boxes[:, 2])
@@ -217,11 +234,11 @@ def outside_boxes(
 
 
 def at_step(values: Array, at: StepIndex) -> Array:
-    """Return the entry of a step: of moving obstacles, or of a tube's radii.
+    """Return the value of a step, such as the place of an obstacle that moves.
 
     Args:
-        values: (horizon, …).
-        at: the step; beyond the last entry, that one.
+        values: one for each step, (horizon, …).
+        at: the step. Beyond the last value, that value holds.
     """
     return values[jnp.minimum(at.number, values.shape[0] - 1)]
 
@@ -270,10 +287,16 @@ class FreeTask:
 
     def task(self) -> Task:
         """Return the planning problem as functions."""
-        box = np.broadcast_arrays(self.control_low, self.control_high)
-        low, high = (jnp.asarray(end, dtype=float) for end in box)
-        steps = self.prepare, self.step, _check_reference, self.charge
-        return Task(low, high, self.weights, *steps)
+        low, high = np.broadcast_arrays(self.control_low, self.control_high)
+        return Task(
+            low=jnp.asarray(low, dtype=float),
+            high=jnp.asarray(high, dtype=float),
+            weights=self.weights,
+            prepare=self.prepare,
+            step=self.step,
+            check=_check_reference,
+            cost=self.charge,
+        )
 
     def prepare(
         self,
@@ -287,11 +310,14 @@ class FreeTask:
         # Before the first control, slew limits count from rest.
         rest = self.limit(jnp.zeros_like(start.control), start.control)
         before = jnp.where(start.known, start.control, rest)
-        # Integers become real if the dynamics make them so: a scan keeps types.
+        # Integers become real numbers if the dynamics make them so, because the types
+        # of a scan's carry must not change.
         after = jax.eval_shape(self.dynamics, params, observation, before, env)
-        state = jax.tree.map(
-            lambda leaf, like: jnp.asarray(leaf, like.dtype), observation, after
-        )
+
+        def as_after(leaf: Any, after: jax.ShapeDtypeStruct) -> Array:
+            return jnp.asarray(leaf, after.dtype)
+
+        state = jax.tree.map(as_after, observation, after)
         return RolloutSetup((params, env), Sample((), state, before), reference)
 
     def step(
@@ -307,7 +333,12 @@ class FreeTask:
         params, env = context
         control = self.limit(nu, before.control)
         state = self.dynamics(params, before.state, control, env)
-        return StepResult(Sample((), state, control), control, control, state)
+        return StepResult(
+            sample=Sample((), state, control),
+            control=control,
+            perturbation=control,
+            state=state,
+        )
 
     def charge(
         self, weights: Any, before: Sample, after: Sample, goal: Any, at: StepIndex

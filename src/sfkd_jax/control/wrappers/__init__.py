@@ -1,1 +1,1 @@
-"""Controllers around a controller: shield, adaptation, delay."""
+"""Controllers around a controller: gate, adaptation and shield."""

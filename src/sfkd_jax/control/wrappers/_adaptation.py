@@ -1,4 +1,4 @@
-"""Adaptation while driving: estimate unmeasured causes, and drive with them."""
+"""Adaptation while driving: unmeasured causes are estimated and taken into account."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ from sfkd_jax.types import (
 )
 
 TOLERANCE = 1.1
-"""The estimates are not used while their squared prediction errors exceed those of the
-model alone by more than this factor.
+"""Factor by which the squared prediction errors with the estimates may exceed those of
+the model alone. Beyond it the estimates are not used.
 """
 
 
@@ -64,58 +64,65 @@ class AdaptiveState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Adaptation(Stateful):
-    """A controller along a path with estimates of what nobody measures.
+    """A controller along a path that estimates what nobody measures.
 
-    The unmeasured causes are a side force f (relative to the largest of E), an error of
-    the steering, of the drive, and a steering error and side force in proportion to κ:
+    The unmeasured causes θ are a side force f (relative to the largest one of E), an
+    error of the steering, an error of the drive, and a steering error and a side force
+    that are proportional to κ:
 
         ξ⁺ = F(ξ, u + Δu(θ); κ, v_ref, e(f)) + (f beyond E) ∂F/∂f
 
-    An extended Kalman filter estimates (ξ, θ). Between steps f stays or jumps, which
-    two filters joined by a Markov chain follow (interacting multiple models); with
-    `estimate_env` each of them exists for every friction of a grid, f is the wind, and
-    nothing else is estimated. Per control step:
+    An extended Kalman filter estimates (ξ, θ). Between two steps f stays or jumps. Two
+    filters that are joined by a Markov chain follow that (interacting multiple models).
+    With `estimate_env` each of them exists for every friction of a grid, f is the wind,
+    and nothing else is estimated. In each control step
 
-    1. the measured ξ corrects (ξ, θ), see `Estimator.follow` for those that do not fit;
-    2. e takes up the force within E, a compensation the rest, u the input errors;
+    1. the measured ξ corrects (ξ, θ); see `Estimator.follow` for one that does not fit;
+    2. e takes up the force within E, a compensation takes up the rest of the force, and
+       u the input errors;
     3. the wrapped controller plans with all of that.
 
     Only e, an offset of the inputs and an offset of the latent step change. The weights
     that a certificate is about do not, so the rate and its witness stay what they are.
-    θ is data of the state: nothing is compiled again.
+    θ is data of the state, so nothing is compiled again.
 
-    `info` gains `env_estimate` (the e planned with), `causes` (5,), `causes_std` (5,),
-    `rejected` (nothing was learned from the measurement) and `adapting` (over the last
-    seconds the estimates did not predict worse than the model alone; otherwise they are
-    not used).
+    `info` gains `env_estimate` (the e that is planned with), `causes` (5,),
+    `causes_std` (5,), `rejected` (nothing was learned from the measurement) and
+    `adapting` (over the last seconds the estimates did not predict worse than the model
+    alone; otherwise they are not used).
 
     Attributes:
-        inner: built with `with_offset(model)`; receives `Offset` parameters.
+        inner: controller that was built with `with_offset(model)`, since it receives
+            `Offset` parameters.
         model: in path coordinates, without offset.
-        law: around which it was learned.
+        law: around which the model was learned.
         control_low: lower limits of u.
         control_high: upper limits of u.
         env_low: lower end of E = (friction, wind).
-        env_high: upper end of E; the wind's box is symmetric.
-        estimate_env: infer e as well; the `env` argument of `act` is not read.
-        power: of the second entry of e in its side force: 2 of a wind, 1 of a force.
+        env_high: upper end of E; the box of the wind is symmetric.
+        estimate_env: whether e is estimated as well; the `env` argument of `act` is
+            then not read.
+        power: exponent of the second entry of e in its side force: 2 of a wind, 1 of a
+            force.
         jump: probability that the force jumps between two steps.
         jump_size: standard deviation of a jump, relative to the largest force of E.
         force_drift: standard deviation of its change over a step without a jump.
-        slow_prior: standard deviations of the errors of steering [rad], drive [control
-            unit], steering and relative side force in the tightest turn, before the
-            first measurement.
-        slow_drift: of their change over a step: the slower, the longer their memory.
+        slow_prior: standard deviations, before the first measurement, of the errors of
+            steering [rad] and drive [control unit], and of the steering error and
+            relative side force in the tightest turn.
+        slow_drift: standard deviations of their changes over a step. The smaller they
+            are, the longer is the memory of the estimates.
         shrinkage: of a force that could be noise, see `Estimator.causes`; not used with
             `estimate_env`.
         friction_points: number of hypotheses on friction, with `estimate_env`.
-        friction_drift: standard deviation of friction over a step.
+        friction_drift: standard deviation of the change of friction over a step.
         dwell: mean number of steps between jumps of friction.
-        sensor_noise: standard deviation per state of the vehicle; further entries are
-            ignored. A setting of () stands for the sensors that the vehicle states.
-        model_error: standard deviation of one step of the model, per entry of ξ;
-            further entries are ignored. A setting of () stands for what the models of
-            the known states err by.
+        sensor_noise: standard deviation of each measured state of the vehicle; further
+            entries are ignored. As a setting, () stands for the sensors that the
+            vehicle states.
+        model_error: standard deviation of one step of the model, for each entry of ξ;
+            further entries are ignored. As a setting, () stands for the errors of the
+            models that ship, which are known for their states alone.
 
     Source: Blom and Bar-Shalom (1988); Pannocchia and Rawlings (2003).
     """
@@ -165,18 +172,20 @@ class Adaptation(Stateful):
     def _noise(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Standard deviations of the measured ξ and of one step of the model."""
         size = self.law.gain.shape[-1]
-        # The position's two entries become the one of e_y.
+        # The two entries of the position become the one of e_y.
         sensors = (self.sensor_noise[0], *self.sensor_noise[2:])
         return sensors[:size], self.model_error[:size]
 
     def init(self, key: Key) -> AdaptiveState:
         """Return the state before the first control step."""
         noise, _ = self._noise
-        # A wide prior where e is unknown; elsewhere the force is only what e misses.
-        force = [0.1, *self.slow_prior]
-        if self.estimate_env:  # in a window this short, not told apart from the rest
-            force = [1.0, *[0.0] * len(self.slow_prior)]
-        prior = jnp.asarray([*noise, *force], dtype=float) ** 2
+        # The force is only what the measured e misses.
+        causes = [0.1, *self.slow_prior]
+        if self.estimate_env:
+            # If e is unknown the prior of the force is wide. Other causes cannot be
+            # told from it in so short a time.
+            causes = [1.0, *[0.0] * len(self.slow_prior)]
+        prior = jnp.asarray([*noise, *causes], dtype=float) ** 2
         count = self._estimator.frictions.shape[0]
         belief = Belief(
             bank=Bank(
@@ -205,7 +214,8 @@ class Adaptation(Stateful):
         params = fold(self.model, params)
         env = self._inside(env)
         road = preview.road[0]
-        # Nothing is learned from what the gate did not believe, nor at another rate.
+        # Nothing is learned from a measurement that the gate did not believe, nor at
+        # another rate.
         usable = jnp.all(preview.measured) & preview.on_time
         belief, rejected = estimator.follow(params, before, coordinates, usable)
         adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
@@ -224,8 +234,9 @@ class Adaptation(Stateful):
             offset, state.inner, coordinates, inside, preview
         )
         control = control + offset.inputs[:2] - input_error(causes, road)
-        limits = jnp.asarray(self.control_low), jnp.asarray(self.control_high)
-        control = jnp.clip(control, *limits)
+        control = jnp.clip(
+            control, jnp.asarray(self.control_low), jnp.asarray(self.control_high)
+        )
 
         report: ControllerInfo = {
             **info,
@@ -240,23 +251,29 @@ class Adaptation(Stateful):
 
     @cached_property
     def _estimator(self) -> Estimator:
-        """For each friction a filter whose force stays, and one where it jumps."""
-        # Constants of the program, also where a program is traced when they are made.
+        """The estimator: two filters for each friction; the force stays or jumps."""
+        # These arrays are constants, even if a program is being traced at the time.
         with jax.ensure_compile_time_eval():
             noise, error = self._noise
             low = jnp.asarray(self.env_low, dtype=float)
             high = jnp.asarray(self.env_high, dtype=float)
             frictions = jnp.full(1, jnp.nan, dtype=float)
             chain = jnp.ones((1, 1))
+            slow_drift = self.slow_drift
             if self.estimate_env:
-                ends = self.env_low[FRICTION], self.env_high[FRICTION]
-                points = self.friction_points
-                frictions = jnp.linspace(*ends, points)
-                drift = self.friction_drift
-                chain = transition_matrix(*ends, points, drift, self.dwell)
+                slow_drift = (0.0,) * (CAUSES - 1)
+                lowest = self.env_low[FRICTION]
+                highest = self.env_high[FRICTION]
+                frictions = jnp.linspace(lowest, highest, self.friction_points)
+                chain = transition_matrix(
+                    lowest,
+                    highest,
+                    self.friction_points,
+                    self.friction_drift,
+                    self.dwell,
+                )
             jumps = jnp.tile(jnp.array([1.0 - self.jump, self.jump]), (2, 1))
-            slow = self.slow_drift if not self.estimate_env else [0.0] * (CAUSES - 1)
-            drift = jnp.asarray([*error, self.force_drift, *slow]) ** 2
+            drift = jnp.asarray([*error, self.force_drift, *slow_drift]) ** 2
             drifts = jnp.stack([drift, drift.at[len(error)].set(self.jump_size**2)])
             return Estimator(
                 loop=Loop(self.model, self.law, low, high, self.power),
@@ -267,10 +284,12 @@ class Adaptation(Stateful):
             )
 
     def _inside(self, env: Environment) -> Environment:
-        """e in its box; the middle of it if e is estimated."""
+        """Return e, clipped to its box; the middle of the box if e is estimated."""
         low = jnp.asarray(self.env_low)
         high = jnp.asarray(self.env_high)
-        return 0.5 * (low + high) if self.estimate_env else jnp.clip(env, low, high)
+        if self.estimate_env:
+            return 0.5 * (low + high)
+        return jnp.clip(env, low, high)
 
 
 def _compensation(
@@ -281,14 +300,21 @@ def _compensation(
     coordinates: PathState,
     excess: Scalar,
 ) -> Offset:
-    """The model with a force beyond E and the steering that balances it.
+    """Return the model with a force beyond E and with the steering that balances it.
 
         d = excess · ∂ξ⁺/∂force,   Δξ = A Δξ + B δ + d,   Δe_y = Δv = 0,
         z⁺ = F(z, w + δ; e) + ∂Φ/∂ξ d
 
-    δ is the offset-free target of the closed loop (Pannocchia and Rawlings, 2003);
-    only its steering is used. A and B are the derivatives of one step of the loop; e
-    has the force inside E, `excess` is what lies beyond, relative to the largest in E.
+    δ is the offset-free target of the closed loop (Pannocchia and Rawlings, 2003); only
+    its steering is used. A and B are the derivatives of one step of the loop.
+
+    Args:
+        loop: the learned closed loop.
+        params: of the model.
+        env: e, with the part of the force that lies inside E.
+        road: κ [1/m] and v_ref [m/s].
+        coordinates: estimate of ξ.
+        excess: part of the force beyond E, relative to the largest force in E.
     """
     model = loop.model
     size = coordinates.shape[0]
@@ -301,12 +327,12 @@ def _compensation(
         return expected_coordinates(model, fiber, xi, nu, road)
 
     A, B = jax.jacfwd(advance, (0, 1))(coordinates, jnp.zeros(2))
-    # Unknown are steering and drive in place of e_y and v, which stay at 0.
+    # The unknowns are steering and drive in place of e_y and v, which stay at 0.
     equations = jnp.eye(size) - A
     equations = equations.at[:, LATERAL].set(-B[:, 0]).at[:, PATH_SPEED].set(-B[:, 1])
     steering = jnp.linalg.solve(equations, shifted)[LATERAL]
-    # Beyond what data and planners add, the model was not learned.
-    most = 2.0 * loop.law.perturbation[0]
-    steering = jnp.clip(jnp.nan_to_num(steering), -most, most)
-    shift = path_state(coordinates), path_state(shifted)
+    # The model was not learned beyond what data and planners add to the law.
+    largest = 2.0 * loop.law.perturbation[0]
+    steering = jnp.clip(jnp.nan_to_num(steering), -largest, largest)
+    shift = (path_state(coordinates), path_state(shifted))
     return Offset(params, jnp.zeros(4).at[0].set(steering), shift)

@@ -1,7 +1,7 @@
 """The estimator of ξ and of unmeasured causes along a path.
 
-Interacting multiple models: extended Kalman filters on the derivatives of the learned
-model, joined by a Markov chain.
+It consists of interacting multiple models: extended Kalman filters, on the derivatives
+of the learned model, that are joined by a Markov chain.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ FRICTION = 0
 WIND = 1
 """Entry of e that is the wind."""
 FORCE, STEERING, DRIVE, TURN_STEERING, TURN_FORCE = range(5)
-"""Entries of the causes: the last two are in proportion to κ."""
+"""Entries of the causes. The last two are proportional to κ."""
 CAUSES = 5
+"""Number of causes."""
 BOUNDS = (4.0, 0.1, 3.0, 0.1, 4.0)
 """Largest causes that are believed: four times the side force of E, 6° of steering."""
 FORCE_STEP = 0.25
-"""Half the difference of relative side forces that a slope is taken over."""
+"""Half the distance of the two relative side forces that give a slope."""
 TIGHTEST = 0.02
-"""Curvature [1/m] at which the causes in proportion to κ have their full effect."""
+"""Curvature [1/m] at which the causes proportional to κ have their full effect."""
 MEMORY = 0.97
 """Forgetting factor of the scores: about 3 s at 10 Hz."""
 LARGEST_SCORE = 25.0
@@ -59,9 +60,9 @@ class Bank(NamedTuple):
 
     def variance(self) -> Float[Array, " n"]:
         """Return the variance over all filters, entry by entry."""
-        spread = (self.means - self.mean()) ** 2
-        own = jnp.diagonal(self.covariances, axis1=1, axis2=2)
-        return self.probabilities @ (own + spread)
+        between_filters = (self.means - self.mean()) ** 2
+        within_filters = jnp.diagonal(self.covariances, axis1=1, axis2=2)
+        return self.probabilities @ (within_filters + between_filters)
 
 
 def mixed(bank: Bank, transition: Float[Array, "filter filter"]) -> Bank:
@@ -73,7 +74,7 @@ def mixed(bank: Bank, transition: Float[Array, "filter filter"]) -> Bank:
     """
     joint = transition * bank.probabilities[:, None]
     expected = joint.sum(axis=0)
-    # No division by 0: every entry of Π is positive, hence every entry of c.
+    # There is no division by 0: every entry of Π is positive, hence every entry of c.
     weights = joint / expected
     means = weights.T @ bank.means
     gaps = bank.means[:, None] - means[None]
@@ -87,14 +88,14 @@ def corrected(
     measurement: Float[Array, " sensor"],
     variances: Float[Array, " sensor"],
 ) -> tuple[Bank, Bool[Array, ""]]:
-    """Return the bank after a measurement of the first entries, and if it is explained.
+    """Return the bank after a measurement of its first entries.
 
     The sensors are independent and processed one by one, in Joseph's form, which keeps
     covariances positive in float32.
 
     Returns:
-        The bank, and False if every filter is farther away than `OUTLIER` or is not
-        finite.
+        The bank, and whether the measurement is explained. It is not if every filter is
+        farther away than `OUTLIER` or is not finite.
     """
     means = bank.means
     covariances = bank.covariances
@@ -111,7 +112,7 @@ def corrected(
         covariances += variances[entry] * gain[:, :, None] * gain[:, None, :]
         surprise = surprise - 0.5 * innovation**2 / variance
         fit = fit - 0.5 * jnp.log(variance)
-    # A filter of NaN counts as impossible, or it would make all probabilities NaN.
+    # A filter that is NaN counts as impossible, or all probabilities would be NaN.
     fit = jnp.where(jnp.isfinite(surprise), fit + surprise, -jnp.inf)
     relative = jnp.exp(fit - jnp.max(fit)) + LEAST_LIKELIHOOD
     weights = bank.probabilities * relative
@@ -122,7 +123,7 @@ def corrected(
 def transition_matrix(
     low: float, high: float, points: int, drift: float, dwell: float
 ) -> Float[Array, "m m"]:
-    """Return Π, symmetric: diffusion by the drift on a grid, and jumps to anywhere.
+    """Return the symmetric Π of diffusion on a grid and of jumps to any of its points.
 
     Args:
         low: lower end of the grid.
@@ -139,7 +140,7 @@ def transition_matrix(
 
 
 class Applied(NamedTuple):
-    """What acts on the vehicle over one step: u, (κ [1/m], v_ref [m/s]) and e in E."""
+    """What acts on the vehicle over a step: u, (κ [1/m], v_ref [m/s]) and e in E."""
 
     control: Control
     road: Float[Array, " 2"]
@@ -152,7 +153,7 @@ def side_force(causes: Float[Array, " cause"], road: Float[Array, " 2"]) -> Scal
 
 
 def input_error(causes: Float[Array, " cause"], road: Float[Array, " 2"]) -> Control:
-    """Return what acts beside the control: steering [rad], drive [control unit]."""
+    """Return what acts besides the control: steering [rad], drive [control unit]."""
     steering = causes[STEERING] + causes[TURN_STEERING] * road[0] / TIGHTEST
     return jnp.stack([steering, causes[DRIVE]])
 
@@ -173,7 +174,7 @@ class Loop(NamedTuple):
 
     def with_force(self, env: Environment, force: Scalar) -> Environment:
         """Return e with the wind of a relative side force."""
-        # The root has no derivative at 0; nothing differentiates by the force.
+        # The root has no derivative at 0, but nothing is differentiated by the force.
         root = jnp.sign(force) * jnp.abs(force) ** (1.0 / self.power)
         return env.at[WIND].set(self.high[WIND] * root)
 
@@ -182,7 +183,7 @@ class Loop(NamedTuple):
     ) -> tuple[Environment, Scalar]:
         """Return the e in E with as much of an additional force as fits, and the rest.
 
-        Forces are relative to the largest in E.
+        Forces are relative to the largest one in E.
         """
         total = self.relative_force(env) + force
         inside = jnp.clip(total, -1.0, 1.0)
@@ -201,8 +202,8 @@ class Loop(NamedTuple):
     def force_slope(self, params: Params, applied: Applied, xi: PathState) -> PathState:
         """Return ∂ξ⁺/∂(relative side force) at a given control.
 
-        A difference over the forces near that of e; at an end of E, into E. Beyond E
-        the model is continued along this slope.
+        It is a difference quotient over forces on both sides of that of e; at an end of
+        E it is one-sided. Beyond E the model is continued along this slope.
         """
         force = self.relative_force(applied.env)
         ends = jnp.clip(force + jnp.array([-FORCE_STEP, FORCE_STEP]), -1.0, 1.0)
@@ -222,26 +223,26 @@ class Loop(NamedTuple):
     ) -> tuple[PathState, Float[Array, "coordinate vector"]]:
         """Return ξ⁺ under unmeasured causes, and its Jacobian by (ξ, causes).
 
-        The force acts as wind within E and along `force_slope` beyond it; the e of
-        `applied` is that without the causes.
+        Within E the force acts as wind, and beyond E along `force_slope`. `applied` has
+        the e without the causes.
         """
-        at = xi.shape[0]
+        size = xi.shape[0]
         road = applied.road
         env, excess = self.split_force(applied.env, side_force(causes, road))
         applied = applied._replace(env=env)
         slope = self.force_slope(params, applied, xi)
 
         def advance(vector: Float[Array, " vector"]) -> PathState:
-            control = applied.control + input_error(vector[at:], road)
-            given = applied._replace(control=control)
-            return self.next_coordinates(params, given, vector[:at])
+            control = applied.control + input_error(vector[size:], road)
+            acting = applied._replace(control=control)
+            return self.next_coordinates(params, acting, vector[:size])
 
         vector = jnp.concatenate([xi, causes])
         jacobian = jax.jacfwd(advance)(vector)
-        # By differences: the root in `with_force` has no derivative at 0.
-        jacobian = jacobian.at[:, at + FORCE].set(slope)
+        # From difference quotients: the root in `with_force` has no derivative at 0.
+        jacobian = jacobian.at[:, size + FORCE].set(slope)
         in_turns = road[0] / TIGHTEST * slope
-        jacobian = jacobian.at[:, at + TURN_FORCE].set(in_turns)
+        jacobian = jacobian.at[:, size + TURN_FORCE].set(in_turns)
         return advance(vector) + excess * slope, jacobian
 
 
@@ -257,7 +258,7 @@ class Belief(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimator:
-    """An extended Kalman filter for each hypothesis on friction and on jumps of f."""
+    """An extended Kalman filter for each hypothesis on friction and on force jumps."""
 
     loop: Loop  # the learned closed loop
     transition: Float[Array, "filter filter"]  # of the Markov chain of the filters
@@ -274,10 +275,10 @@ class Estimator:
     ) -> tuple[Belief, Bool[Array, ""]]:
         """Return the belief after one step and a measurement, and if it was rejected.
 
-        A measurement that is not usable, or farther from every filter than a jump of
-        the force could explain, is rejected: the causes stay as predicted, so that a
-        sensor that freezes or jumps is never taken for a force. If it is usable, ξ
-        starts anew from it.
+        A measurement is rejected if it is not usable, or farther from every filter than
+        a jump of the force could explain. The causes then stay as predicted, so a
+        sensor that freezes or jumps is never taken for a force. If a rejected
+        measurement is usable, ξ starts anew from it.
         """
         size = measured.shape[0]
         expected = self._advanced(params, belief)
@@ -289,46 +290,51 @@ class Estimator:
         after = after._replace(means=after.means.at[:, size:].set(causes))
         learned = usable & explained
         bank = _select(learned, after, expected)
-        # Not explained, but usable: the car is believed to be there, without a cause.
+        # Where a usable measurement is not explained, the car is believed to be there,
+        # and no cause is learned.
         bank = _select(usable & ~learned, self._restarted(bank, measured), bank)
         scores = self._scores(params, belief, expected, measured)
         scores = jnp.where(learned, scores, belief.scores)
         return belief._replace(bank=bank, scores=scores), ~learned
 
     def causes(self, belief: Belief, shrinkage: float) -> Float[Array, " cause"]:
-        """Return the estimated causes, with f̂ max(0, 1 − s var f / f̂²) of the force.
+        """Return the estimated causes, with a force that is shrunk (James-Stein).
 
-        A force that could be noise is thereby left alone (James-Stein).
+            f̂ max(0, 1 − s var f / f̂²)
+
+        A force that could be noise is thereby not compensated. `shrinkage` is s.
         """
         size = self.sensors.shape[0]
         causes = belief.bank.mean()[size:]
         variance = belief.bank.variance()[size:]
-        kept = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
-        return causes.at[FORCE].multiply(jnp.maximum(kept, 0.0))
+        share = 1.0 - shrinkage * variance[FORCE] / (causes[FORCE] ** 2 + 1e-9)
+        return causes.at[FORCE].multiply(jnp.maximum(share, 0.0))
 
     def _advanced(self, params: Params, belief: Belief) -> Bank:
-        """The bank one step later, without a measurement."""
+        """Return the bank one step later, without a measurement."""
         bank = mixed(belief.bank, self.transition)
         size = self.sensors.shape[0]
 
-        def one(mean: Array, friction: Array) -> tuple[Array, Array]:
-            given = _assuming(belief.applied, friction)
+        def predict(mean: Array, friction: Array) -> tuple[Array, Array]:
+            applied = _assuming(belief.applied, friction)
             xi = mean[:size]
             causes = mean[size:]
-            after, slope = self.loop.predicted(params, given, xi, causes)
-            return jnp.concatenate([after, causes]), slope
+            after, jacobian = self.loop.predicted(params, applied, xi, causes)
+            return jnp.concatenate([after, causes]), jacobian
 
-        means, slopes = jax.vmap(one)(bank.means, self.frictions)
-        stays = jnp.eye(bank.means.shape[1])[size:]
-        stays = jnp.tile(stays, (means.shape[0], 1, 1))
-        slopes = jnp.concatenate([slopes, stays], axis=1)
-        spread = slopes @ bank.covariances @ slopes.swapaxes(1, 2) + self.noise
-        # Symmetric in spite of rounding.
-        spread = 0.5 * (spread + spread.swapaxes(1, 2))
-        return Bank(means, spread, bank.probabilities)
+        means, jacobians = jax.vmap(predict)(bank.means, self.frictions)
+        # The causes stay as they are.
+        rows = jnp.eye(bank.means.shape[1])[size:]
+        rows = jnp.tile(rows, (means.shape[0], 1, 1))
+        jacobians = jnp.concatenate([jacobians, rows], axis=1)
+        covariances = jacobians @ bank.covariances @ jacobians.swapaxes(1, 2)
+        covariances = covariances + self.noise
+        # Rounding must not make them unsymmetric.
+        covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
+        return Bank(means, covariances, bank.probabilities)
 
     def _restarted(self, bank: Bank, measured: PathState) -> Bank:
-        """The bank at a measured ξ, with the causes as they are."""
+        """Return the bank at a measured ξ, with the causes as they are."""
         size = measured.shape[0]
         covariances = bank.covariances.at[:, :size].set(0.0).at[:, :, :size].set(0.0)
         covariances = covariances.at[:, :size, :size].set(jnp.diag(self.sensors))
@@ -338,24 +344,28 @@ class Estimator:
     def _scores(
         self, params: Params, belief: Belief, expected: Bank, measured: PathState
     ) -> Float[Array, " 2"]:
-        """The scores after one more prediction."""
+        """Return the scores after one more prediction."""
         size = measured.shape[0]
         mean = belief.bank.mean()
         applied = _assuming(belief.applied, expected.probabilities @ self.frictions)
-        nothing = jnp.zeros_like(mean[size:])
-        alone, _ = self.loop.predicted(params, applied, mean[:size], nothing)
-        both = jnp.stack([expected.mean()[:size], alone])
-        errors = jnp.minimum((both - measured) ** 2 / self.sensors, LARGEST_SCORE)
+        no_causes = jnp.zeros_like(mean[size:])
+        model_alone, _ = self.loop.predicted(params, applied, mean[:size], no_causes)
+        predictions = jnp.stack([expected.mean()[:size], model_alone])
+        errors = (predictions - measured) ** 2 / self.sensors
+        errors = jnp.minimum(errors, LARGEST_SCORE)
         return MEMORY * belief.scores + (1.0 - MEMORY) * errors.mean(axis=1)
 
 
 def _assuming(applied: Applied, friction: Array) -> Applied:
-    """What acts, if e is that of a filter: measured, or its own friction, no wind."""
+    """Return what acts if the hypothesis of a filter is true.
+
+    With a friction of NaN, e is measured; otherwise it is that friction without wind.
+    """
     hypothesis = jnp.zeros_like(applied.env).at[FRICTION].set(friction)
     env = jnp.where(jnp.isnan(friction), applied.env, hypothesis)
     return applied._replace(env=env)
 
 
 def _select(choice: Bool[Array, ""], first: Bank, second: Bank) -> Bank:
-    """One of two banks."""
+    """Return the first of two banks where `choice` is true, else the second."""
     return jax.tree.map(partial(jnp.where, choice), first, second)

@@ -26,7 +26,7 @@ Readings = Float[Array, " chart"]  # ξ, and its heading once more
 class InnovationState(NamedTuple):
     """What the test carries from one control step to the next."""
 
-    # Of this step, predicted from the last measured one; NaN without.
+    # Readings of this step, predicted from the last measured ones; NaN without those.
     expected: Readings
     level: Scalar  # of the prediction, see `SteadyTurn.level`
     means: Means  # moving means of the scores
@@ -40,12 +40,13 @@ class InnovationTest(NamedTuple):
         s_i = r_i / σ_i(0) · min_j (σ_j(0) / σ_j(level))²
         m_w ← m_w + w (s − m_w),   statistic = max |m_w| / threshold_w
 
-    r is from one measurement to the next, so that noise telescopes in a mean over w⁻¹
-    steps, and what lasts decides. The weight is that of the likelihood ratio of a
-    constant error in noise whose size changes, 1/σ². Short windows detect a jump, long
-    ones a drift (geometric moving averages; Roberts, 1959). Above 1 the vehicle or its
-    sensors are not those of the calibration. A last chart compares the heading with the
-    steady turn that the law knows for the steering: exact where F is not.
+    r is from one measurement to the next, so noise telescopes in a mean over w⁻¹ steps,
+    and lasting errors decide. The weight is that of the likelihood ratio of a constant
+    error in noise whose size changes, 1/σ². Short windows detect a jump, long ones a
+    drift (geometric moving averages; Roberts, 1959). A statistic above 1 means that the
+    vehicle or its sensors are not those of the calibration. A last chart compares the
+    heading with the steady turn that the law knows for the steering, which is exact
+    where F is not.
 
     Attributes:
         levels: rising, of `SteadyTurn.level`.
@@ -84,13 +85,19 @@ class InnovationTest(NamedTuple):
     def moved(self, means: Means, innovation: Readings, level: Scalar) -> Means:
         """Return the moving means with one more innovation, NaN without one."""
         usual = self.deviation[0]
-        deviation = jax.vmap(lambda column: jnp.interp(level, self.levels, column))
-        # Of all its entries: where a model errs in one, it errs in others for a while.
-        ratio = jnp.max((deviation(self.deviation.T) / usual)[:-1])
+
+        def interpolate(column: Float[Array, " level"]) -> Scalar:
+            return jnp.interp(level, self.levels, column)
+
+        deviation = jax.vmap(interpolate)(self.deviation.T)
+        # The largest ratio serves all entries: where a model errs in one of them, it
+        # errs in others for a while.
+        ratio = jnp.max((deviation / usual)[:-1])
         ratio = jnp.append(jnp.full_like(usual[1:], jnp.maximum(ratio, 1.0)), 1.0)
         score = innovation / (usual * ratio**2)
         moved = means + jnp.asarray(WINDOWS)[:, None] * (score - means)
-        # Held, not towards zero: a sensor that fails must not end an alarm.
+        # The means are held, not moved towards 0: a sensor that fails must not end an
+        # alarm.
         return jnp.where(jnp.isnan(innovation), means, moved)
 
 

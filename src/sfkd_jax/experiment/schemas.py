@@ -1,0 +1,49 @@
+"""The settings of a run as Hydra's schemas, against which it checks options."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import is_dataclass
+from typing import Any, get_type_hints
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf
+
+from sfkd_jax import build
+from sfkd_jax.experiment.options import (
+    AlongPathSettings,
+    LogSettings,
+    Settings,
+    SimulatedSettings,
+)
+
+
+def register() -> None:
+    """Put the dataclasses of all groups into Hydra's store, as schemas."""
+    OmegaConf.register_new_resolver("home", os.path.expanduser, replace=True)
+    datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
+    variants: dict[str, Any] = {
+        "vehicle": build.VEHICLES,
+        "model": build.MODEL_SETTINGS,
+        "controller": build.CONTROLLER_SETTINGS,
+        "dataset": datasets,
+    }
+    for group, hint in get_type_hints(Settings).items():
+        # The primary config states the values of these commands itself.
+        if not is_dataclass(hint) or group in ("demo", "collect"):
+            continue
+        for variant, dataclass_type in variants.get(group, {"": hint}).items():
+            ConfigStore.instance().store(
+                group=group,
+                name=f"{variant}_schema" if variant else "schema",
+                node=_writable(OmegaConf.structured(dataclass_type)),
+            )
+
+
+def _writable(node: Any) -> Any:
+    """Let Hydra write options into what OmegaConf made of a frozen dataclass."""
+    OmegaConf.set_readonly(node, None)
+    for inner in map(node._get_node, node):
+        if isinstance(inner, DictConfig):
+            _writable(inner)
+    return node
