@@ -168,7 +168,7 @@ def choose(table: Mapping[str, T], name: Any, what: str) -> T:
 
 
 def _is_below(path: str) -> bool:
-    """Whether a relative path is printable and stays below where it starts."""
+    """Return whether a relative path is printable and stays below its start."""
     parts = path.split("/")
     return path.isprintable() and "\\" not in path and not {"", ".", ".."} & set(parts)
 

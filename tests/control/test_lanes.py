@@ -11,7 +11,7 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import control
-from sfkd_jax.control.lanes._manoeuvre import Situation
+from sfkd_jax.control.lanes._judging import Situation
 from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
 from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic

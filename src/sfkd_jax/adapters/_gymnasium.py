@@ -123,7 +123,7 @@ class GymnasiumVehicle(gymnasium.Env):
         return _image(self._task, *self._reached(), self._driven)
 
     def _reached(self) -> tuple[Scenario, Moment]:
-        """The road, and where the car is on it."""
+        """Return the road, and where the car is on it."""
         if self._now is None:
             raise gymnasium.error.ResetNeeded("call reset first")
         return self._now

@@ -3,9 +3,9 @@
 from sfkd_jax.control._factory import factory as factory
 from sfkd_jax.control.lanes._in_lane import InLane as InLane
 from sfkd_jax.control.lanes._in_lane import in_lane as in_lane
-from sfkd_jax.control.lanes._manoeuvre import Class as Class
+from sfkd_jax.control.lanes._judging import Class as Class
 from sfkd_jax.control.lanes._manoeuvre import Manoeuvres as Manoeuvres
-from sfkd_jax.control.laws._feedback import NEAR as NEAR
+from sfkd_jax.control.laws._derivation import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._feedback import LinearFeedback as LinearFeedback
 from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
 from sfkd_jax.control.laws._feedback import no_feedback as no_feedback
@@ -13,9 +13,9 @@ from sfkd_jax.control.laws._feedback import path_errors as path_errors
 from sfkd_jax.control.laws._feedback import path_feedback as path_feedback
 from sfkd_jax.control.laws._path_law import TEXTBOOK as TEXTBOOK
 from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
-from sfkd_jax.control.laws._path_law import derive_path_law as derive_path_law
 from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
 from sfkd_jax.control.laws._path_law import textbook_law as textbook_law
+from sfkd_jax.control.laws._steady_turn import NEAR as NEAR
 from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
 from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc

@@ -4,17 +4,33 @@ import sys
 from importlib.util import find_spec
 
 TRAIN = (
-    *("hydra", "filelock", "optax", "orbax", "cvxpy", "clarabel", "pyarrow", "pint"),
-    *("threadpoolctl", "jinja2", "matplotlib", "pandas", "PIL"),
+    "hydra",
+    "filelock",
+    "optax",
+    "orbax",
+    "cvxpy",
+    "clarabel",
+    "pyarrow",
+    "pint",
+    "threadpoolctl",
+    "jinja2",
+    "matplotlib",
+    "pandas",
+    "PIL",
 )
-"""Modules of the extra `train`."""
+"""Modules that the extra `train` installs."""
+
+
+def _is_installed(name: str) -> bool:
+    """Return whether a module can be imported."""
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
 
 # A package that only loads policies is installed without these, and whoever calls a
 # command then reads one line instead of a traceback.
 for _name in TRAIN:
-    try:
-        _found = find_spec(_name) is not None
-    except ModuleNotFoundError:
-        _found = False
-    if not _found:
+    if not _is_installed(_name):
         sys.exit(f'sfkd_jax: this needs {_name}: pip install "sfkd-jax[train]"')

@@ -37,8 +37,13 @@ CELL = 2048.0
 PLACES = ("observation", "reference", "road", "position")
 """Inputs that begin with x and y [m]."""
 MALFORMED = (
-    *(KeyError, TypeError, ValueError, IndexError, AttributeError),
-    *(OverflowError, RecursionError),
+    KeyError,
+    TypeError,
+    ValueError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
 )
 """Exceptions that a manifest of wrong content can raise."""
 

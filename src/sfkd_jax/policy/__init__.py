@@ -70,7 +70,8 @@ class Policy(TrainedModel):
         if not (self.certificate and self.certificate.get("corridor")):
             raise ValueError(
                 "this policy has no certified corridor to keep a planner in: load one "
-                "in path coordinates with its certificate, as pretrained/dynamic_path"
+                "in path coordinates with its certificate, as by "
+                'sfkd_jax.load("dynamic_path")'
             )
         return self.certificate
 

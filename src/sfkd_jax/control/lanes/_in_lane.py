@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Int
 
 from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control._finite import all_finite
-from sfkd_jax.control.lanes._manoeuvre import Judged, Manoeuvres, Situation
+from sfkd_jax.control.lanes._judging import Judged, Situation
+from sfkd_jax.control.lanes._manoeuvre import Manoeuvres
 from sfkd_jax.control.lanes._reference import (
     BEHIND,
     Committed,
@@ -44,19 +45,29 @@ from sfkd_jax.types import (
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
 LOST = 10.0
-"""Distance from where the car should be, at which it is somewhere else [m]."""
+"""Distance from the expected place beyond which the car is somewhere else [m]."""
 
 
 class LaneState(NamedTuple):
-    """What is carried from one control step to the next."""
+    """What is carried from one control step to the next.
 
-    inner: Any  # state of the controller that follows the reference
-    planner: Any  # state of the search
-    committed: Committed  # the reference
-    progress: Scalar  # of the car along the path of the lane [m]
-    wait: Int[Array, ""]  # number of steps until the next search
-    started: Bool[Array, ""]  # whether there is a reference
-    # Number of steps until a corridor may be claimed; largest in an evasion.
+    Attributes:
+        inner: state of the controller that follows the reference.
+        planner: state of the search.
+        committed: the reference.
+        progress: of the car along the path of the lane [m].
+        wait: number of steps until the next search.
+        started: whether there is a reference.
+        doubt: number of steps until a corridor may be claimed; an evasion sets it to
+            `InLane.trial`.
+    """
+
+    inner: Any
+    planner: Any
+    committed: Committed
+    progress: Scalar
+    wait: Int[Array, ""]
+    started: Bool[Array, ""]
     doubt: Int[Array, ""]
 
 
@@ -64,32 +75,37 @@ class LaneState(NamedTuple):
 class InLane(Stateful):
     """A controller that drives in a lane, round obstacles, or stops before them.
 
-    The planner compares references with the one that is committed; the cheapest that is
-    admissible is committed. If none is, the committed one stays as long as it is free,
-    else the car brakes on it, to stand in front of what is in the way. If it would not
-    stand in time, it evades with the grip, outside the class and without a claim:
-    `corridor` and `clearance` are then NaN. A scene with numbers that are not finite
-    makes it stop.
+    The planner compares references with the committed one, and the cheapest admissible
+    reference is committed. If none is admissible, the committed reference stays as long
+    as it is free. Otherwise the car brakes on it, to stand in front of what is in the
+    way. If it would not stand in time, it evades with all of the grip, outside the
+    class and without a claim: `corridor` and `clearance` are then NaN. If a number of
+    the scene is not finite, the car stops.
 
-    `act` takes a scene, lane and obstacles, in place of the reference. `info` gains
-    `reference` (the window that `inner` follows), `offset` of the reference from the
-    centre line [m], `clearance` (along the whole committed reference the car stays as
-    far from all obstacles [m]; NaN where no corridor holds), `admissible` (the
-    committed reference is inside the class, the lane, and free), `stopping` and
-    `evading` (what is committed is outside the class).
+    `act` takes a scene (lane and obstacles) in place of the reference. `info` gains
+    these entries:
+
+        reference   the window that `inner` follows
+        offset      of the reference from the centre line [m]
+        clearance   distance that the car keeps from all obstacles along the whole
+                    committed reference [m]; NaN where no corridor holds
+        admissible  whether the committed reference is free, and inside class and lane
+        stopping    whether the committed reference ends at rest
+        evading     whether the committed reference is outside the class
 
     Attributes:
-        inner: in the world; its `info` has the `corridor` of the reference.
+        inner: controller in the world; its `info` has the `corridor` of the reference.
         planner: of `Manoeuvres.task`, with horizon 1.
-        manoeuvres: what is planned.
+        manoeuvres: the references to choose from.
         horizon: number of points of the reference that `inner` reads.
-        samples: of the road that are planned, at the spacing of the path.
+        samples: number of samples of the road that are planned, at the spacing of the
+            path.
         period: number of steps from one search to the next.
         friction: entry of e that is the friction; None if none is.
-        lowest: friction where e is not known.
-        lead: time by which the speed of the reference is ahead of its position [s]: a
-            law follows a falling speed that much later.
-        better: relative gain of a reference that replaces the committed one.
+        lowest: friction that is assumed where e is not known.
+        lead: time by which the speed of the reference is ahead of its position [s],
+            because a law follows a falling speed that much later.
+        better: relative gain at which a reference replaces the committed one.
         trial: number of steps without a claim after an evasion.
     """
 
@@ -110,13 +126,16 @@ class InLane(Stateful):
 
     def init(self, key: Key) -> LaneState:
         """Return the state before the first control step."""
-        inner, planner = jax.random.split(key)
-        none = jnp.zeros((3, self.samples))
-        rest = jnp.zeros(self.samples)
+        inner_key, planner_key = jax.random.split(key)
         return LaneState(
-            inner=self.inner.init(inner),
-            planner=self.planner.init(planner),
-            committed=Committed(jnp.zeros((), jnp.int32), none, rest),
+            inner=self.inner.init(inner_key),
+            planner=self.planner.init(planner_key),
+            # On the centre line, at rest.
+            committed=Committed(
+                index=jnp.zeros((), jnp.int32),
+                move=jnp.zeros((3, self.samples)),
+                square=jnp.zeros(self.samples),
+            ),
             progress=jnp.zeros(()),
             wait=jnp.zeros((), jnp.int32),
             started=jnp.asarray(False),
@@ -139,26 +158,32 @@ class InLane(Stateful):
         path = scene[0].path
         kept = task.judge(weights, situation, situation.committed)
         free = ~jnp.any(kept.blocked)
-        # What was committed is judged at every step: what appears is seen at once.
+        # The committed reference is judged at every step, so an obstacle that appears
+        # is noticed at once.
         due = (state.wait <= 0) | ~free
-        planner, committed, taken = jax.lax.cond(
-            due,
-            lambda: self._search(state.planner, situation, kept, free),
-            lambda: (state.planner, situation.committed, jnp.asarray(False)),
-        )
+
+        def search() -> tuple[Any, Committed, Bool[Array, ""]]:
+            return self._search(state.planner, situation, kept, free)
+
+        def keep() -> tuple[Any, Committed, Bool[Array, ""]]:
+            return state.planner, situation.committed, jnp.asarray(False)
+
+        planner, committed, taken = jax.lax.cond(due, search, keep)
         judged = task.judge(weights, situation, committed)
-        # What was admissible stays so; a last resort need not be, until it stands.
+        # An admissible reference stays admissible. A last resort need not be, until the
+        # car stands.
         resorted = (~free | (state.doubt == self.trial)) & ~taken
         evading = resorted & (judged.outside > 0.0)
         doubt = jnp.where(evading, self.trial, jnp.maximum(state.doubt - 1, 0))
         times = task.dt * jnp.arange(1, self.horizon + 1)
         at = partial(window, path, committed, judged.curve, situation.place)
         ahead = at(times).at[:, 3].set(at(times + self.lead)[:, 3])
-        given = state.inner, observation, env, ahead
-        control, inner, info = self.inner.act(params, *given)
+        control, inner, info = self.inner.act(
+            params, state.inner, observation, env, ahead
+        )
         # Outside the class, and until its errors have decayed, nothing is certified.
         corridor = jnp.where(doubt > 0, jnp.nan, info.get("corridor", jnp.nan))
-        # What was needed is the corridor of the certificate; here is that of the step.
+        # The gap is beyond the corridor of the certificate; this step has its own.
         excess = corridor - task.kind.corridor
         room = jnp.min(judged.gap) - excess
         report: Any = {
@@ -185,9 +210,12 @@ class InLane(Stateful):
         scene: Scene,
         clean: Bool[Array, ""],
     ) -> tuple[Scalar, Situation]:
-        """Where the car is along the path [m], and what references are judged by."""
+        """Return where the car is along the path [m], and its situation.
+
+        The situation is what references are judged by.
+        """
         lane, obstacles = scene
-        kind = self.manoeuvres.kind
+        limits = self.manoeuvres.kind
         path = lane.path
         position = observation[:2]
         index = state.committed.index
@@ -195,65 +223,85 @@ class InLane(Stateful):
         known = all_finite(observation)
         guess = state.progress + self.manoeuvres.dt * jnp.sqrt(square[BEHIND])
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
-        # A road may cross itself: the nearest point counts if the car is nowhere else.
+        # A road may cross itself. The nearest point of all counts only if the car is
+        # not near the expected one.
         fresh = known & ~(state.started & (away < LOST))
         nearest = jnp.argmin(jnp.sum((path.points[:, :2] - position) ** 2, axis=1))
         start = jnp.where(fresh, nearest * path.spacing, guess)
         progress, lateral = project(path, position, start)
         progress = jnp.where(known, progress, start)
         if isinstance(path, Lap):
-            # Over the start of the lap the projection begins anew, and all else too.
+            # Where a lap starts again, so do the projection and the samples.
             behind = progress < start - 0.5 * path.length
             index = index - jnp.where(behind, path.points.shape[0] - 1, 0)
         first = jnp.floor(progress / path.spacing).astype(int) - BEHIND
         first = jnp.where(fresh, first, jnp.maximum(first, index))
-        most = kind.acceleration, kind.deceleration
-        road = road_ahead(lane, first, self.samples, most)
-        # It begins where the car is, at its speed.
+        road = road_ahead(
+            lane, first, self.samples, (limits.acceleration, limits.deceleration)
+        )
+        # A new reference begins where the car is, at its speed.
         move = jnp.zeros((3, self.samples)).at[0].set(lateral)
         speed = jnp.maximum(observation[3], 0.0)
-        begun = speed_profile(road.wanted, speed**2, path.spacing, *most)
+        new_square = speed_profile(
+            road.wanted,
+            speed**2,
+            path.spacing,
+            limits.acceleration,
+            limits.deceleration,
+        )
         held = state.committed._replace(index=index).at(first, road.wanted)
-        begun = Committed(first, move, begun)
-        committed = jax.tree.map(partial(jnp.where, fresh), begun, held)
+        new = Committed(first, move, new_square)
         friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
         friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
-        place = progress / path.spacing - first
-        grip = GRAVITY * friction
-        return progress, Situation(road, committed, obstacles, place, grip, clean)
+        return progress, Situation(
+            road=road,
+            committed=jax.tree.map(partial(jnp.where, fresh), new, held),
+            obstacles=obstacles,
+            place=progress / path.spacing - first,
+            grip=GRAVITY * friction,
+            clean=clean,
+        )
 
     def _search(
         self, planner: Any, situation: Situation, kept: Judged, free: Bool[Array, ""]
     ) -> tuple[Any, Committed, Bool[Array, ""]]:
-        """Return the state of the planner, the reference to commit, if it was found."""
+        """Search for a better reference.
+
+        Returns:
+            The state of the planner, the reference to commit, and whether it is one
+            that the search found.
+        """
         task = self.manoeuvres
         before = situation.committed
-        # Its observation is a situation; it needs neither e nor a reference.
+        # The planner observes a situation; it needs neither e nor a reference.
         act: Any = self.planner.act
         row, after, info = act(None, planner, situation, None, None)
         usable = info["healthy"] & info["constraints_kept"]
-        # A plan that continues an old one is not the one that was evaluated.
+        # A plan that goes on with an old one is not the one that was evaluated.
         cost = jnp.where(usable, info["mean_cost"], jnp.inf)
         rows = jnp.concatenate([row[None], task.ways_round(situation)])
 
-        def worth(row: Control) -> Scalar:
+        def cost_of(row: Control) -> Scalar:
             plan = task.reference(situation, row)
             judged = task.judge(planner.tuning.cost, situation, plan)
             return jnp.where(judged.violation <= 0.0, judged.cost, jnp.inf)
 
-        costs = jnp.append(cost, jax.vmap(worth)(rows[1:]))
+        costs = jnp.append(cost, jax.vmap(cost_of)(rows[1:]))
         chosen = jnp.argmin(costs)
-        found = task.reference(situation, rows[chosen])
-        # The next search begins there.
+        cheapest = task.reference(situation, rows[chosen])
+        # The next search begins at the cheapest reference.
         after = after._replace(plan=rows[chosen][None])
         better = costs[chosen] < (1.0 - self.better) * kept.cost
         taken = (better | (kept.violation > 0.0)) & jnp.isfinite(costs[chosen])
-        otherwise = jax.lax.cond(
-            taken | free,
-            lambda: before,
-            lambda: task.resort(planner.tuning.cost, situation, kept),
-        )
-        committed = jax.tree.map(partial(jnp.where, taken), found, otherwise)
+
+        def keep() -> Committed:
+            return before
+
+        def resort() -> Committed:
+            return task.resort(planner.tuning.cost, situation, kept)
+
+        otherwise = jax.lax.cond(taken | free, keep, resort)
+        committed = jax.tree.map(partial(jnp.where, taken), cheapest, otherwise)
         return after, committed, taken
 
 

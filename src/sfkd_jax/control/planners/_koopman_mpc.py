@@ -75,8 +75,8 @@ def koopman_mpc(
                      (e_y, e_ψ, s)_k = C z_k + o
 
     The path enters through its previewed curvature, and e is constant over the horizon.
-    At most 2 T controls are the variables; `box_qp` solves for them, warm started with
-    the shifted plan. Only controls have bounds, so every QP is feasible.
+    The variables are the controls of all steps; `box_qp` solves for them, warm started
+    with the shifted plan. Only controls have bounds, so every QP is feasible.
 
     Args:
         model: with `structure.linear`.
@@ -95,10 +95,17 @@ def koopman_mpc(
         raise ValueError(
             "koopman_mpc needs a model that is linear in a lift (Structure.linear)"
         )
-    low, high = (jnp.asarray(end, dtype=float) for end in (control_low, control_high))
     lifted = _LiftedTracking(model, cost, terminal_weight)
+    task = Task(
+        low=jnp.asarray(control_low, dtype=float),
+        high=jnp.asarray(control_high, dtype=float),
+        weights=cost.weights,
+        prepare=lifted.prepare,
+        step=lifted.step,
+        check=check_path,
+    )
     return _QuadraticProgram(
-        Task(low, high, cost.weights, lifted.prepare, lifted.step, check_path),
+        task,
         horizon=horizon,
         noise_std=(1.0,) * len(control_low),
         iterations=iterations,
@@ -108,7 +115,14 @@ def koopman_mpc(
 
 
 class _LiftedSample(NamedTuple):
-    """Lifted state; path errors and control of the last step, if there was one."""
+    """One rollout of the lifted state.
+
+    Attributes:
+        z: lifted state.
+        errors: path errors after the last step.
+        control: of the last step.
+        known: whether there was a last step.
+    """
 
     z: Float[Array, " rank"]
     errors: PathErrors
@@ -135,18 +149,27 @@ class _LiftedTracking:
         """Return the matrices of e, the lifted observation and the path ahead."""
         assert self.model.structure.linear is not None
         predictor = self.model.structure.linear(self.model.fiber(params, env))
-        reference, known = followable(reference)
+        reference, is_followable = followable(reference)
         curvature = reference_curvature(reference)
         errors = path_errors(observation, reference[0], curvature[0])
         # Progress counts from here: the predictor knows the path by its curvature only.
         place = jnp.stack([jnp.zeros(()), errors.lateral, errors.heading])
         state = jnp.concatenate([place, observation[BODY]])
-        first = _LiftedSample(predictor.lift(state), errors, *start)
-        # The first step has the curvature of the first point, others that of both ends.
+        # The first step has the curvature of the first point, the others the mean of
+        # that at both ends.
         mean = 0.5 * (curvature[1:] + curvature[:-1])
-        over = jnp.concatenate([curvature[:1], mean])
-        targets = PathTarget(reference, over)
-        return RolloutSetup(predictor._replace(lift=None), first, targets, known)
+        step_curvature = jnp.concatenate([curvature[:1], mean])
+        return RolloutSetup(
+            context=predictor._replace(lift=None),
+            start=_LiftedSample(
+                z=predictor.lift(state),
+                errors=errors,
+                control=start.control,
+                known=start.known,
+            ),
+            targets=PathTarget(reference, step_curvature),
+            followable=is_followable,
+        )
 
     def step(
         self,
@@ -167,9 +190,14 @@ class _LiftedTracking:
         last = jnp.where(before.known, before.control, u)
         stage = StageInputs(errors, before.errors, u, last, speed)
         cost = self.cost.stage(weights, stage) * (1.0 + self.terminal_weight * at.last)
-        sample = _LiftedSample(z, errors, u, jnp.ones_like(before.known))
-        # Without the progress: beside the reference point, as all planners report it.
-        return StepResult(sample, u, u, beside(x[1:], target.point), cost)
+        return StepResult(
+            sample=_LiftedSample(z, errors, u, jnp.ones_like(before.known)),
+            control=u,
+            perturbation=u,
+            # All planners report states beside the reference, without the progress.
+            state=beside(x[1:], target.point),
+            cost=cost,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -191,19 +219,21 @@ class _QuadraticProgram(Planner):
             slope = jax.grad(cost_of)(u)
             return slope, slope
 
-        # Quadratic: its derivatives at 0 are all that there is to know.
+        # The cost is quadratic, so its derivatives at 0 determine it.
         H, f = jax.jacfwd(slope_of, has_aux=True)(jnp.zeros(size))
         # A predictor that ignores a control leaves a zero row.
         H = H + REGULARISATION * jnp.max(jnp.diagonal(H)) * jnp.eye(size)
-        low, high = (
-            jnp.broadcast_to(end, plan.shape).ravel()
-            for end in (self.task.low, self.task.high)
-        )
-        # A solution that did not converge is still inside the box, and used.
+        low = jnp.broadcast_to(self.task.low, plan.shape).ravel()
+        high = jnp.broadcast_to(self.task.high, plan.shape).ravel()
+        # A solution that did not converge is still inside the box, and is used.
         solution = box_qp(H, f, low, high, plan.ravel(), iterations=self.iterations)
         cost = cost_of(solution)
-        best = solution.reshape(plan.shape)
-        return SearchResult(best, jnp.isfinite(cost), cost, jnp.full((), jnp.nan))
+        return SearchResult(
+            plan=solution.reshape(plan.shape),
+            usable=jnp.isfinite(cost),
+            cost=cost,
+            effective_samples=jnp.full((), jnp.nan),
+        )
 
 
 def box_qp(
@@ -227,22 +257,23 @@ def box_qp(
 
     Source: Bertsekas (1982); Tassa, Mansard and Todorov (2014), section III.
     """
-    # All lengths as one batch: a search that stops early has no fixed duration.
+    # All step lengths are one batch: a search that stops early has no fixed duration.
     lengths = 0.5 ** jnp.arange(HALVINGS)[:, None]
     diagonal = jnp.diagonal(H)
 
     def improve(x: Float[Array, " n"], _: None) -> tuple[Float[Array, " n"], None]:
         slope = H @ x + f
-        # At a bound, with descent pointing outward: such an entry stays.
+        # An entry stays at a bound where descent points outward.
         active = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))
-        # Their rows become diagonal: the factorisation keeps one shape.
+        # The rows of such entries become diagonal, so the factorisation keeps its
+        # shape.
         reduced = jnp.where(active[:, None] | active, jnp.diag(diagonal), H)
         newton = -cho_solve(cho_factor(reduced), jnp.where(active, 0.0, slope))
         candidates = jnp.clip(x + lengths * newton, low, high)
         moves = candidates - x
-        # Exact for a quadratic: no difference of two large costs.
+        # Exact for a quadratic cost, without the difference of two large costs.
         change = moves @ slope + 0.5 * jnp.sum((moves @ H) * moves, axis=1)
-        # A step that is not finite is the worst of all.
+        # A step that is not finite counts as the worst one.
         change = jnp.where(jnp.isfinite(change), change, jnp.inf)
         best = jnp.argmin(change)
         return jnp.where(change[best] < 0, candidates[best], x), None

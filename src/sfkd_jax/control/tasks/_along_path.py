@@ -16,8 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control._finite import all_finite
-from sfkd_jax.control.laws._feedback import PathErrors, SteadyTurn
+from sfkd_jax.control.laws._feedback import PathErrors
 from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.tasks._path_tracking import LawTask, check_path
 from sfkd_jax.control.tasks._task import (
     PlanningStart,

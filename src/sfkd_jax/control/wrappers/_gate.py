@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control._finite import all_finite
-from sfkd_jax.control.laws._feedback import SteadyTurn
 from sfkd_jax.control.laws._path_law import PathLaw
+from sfkd_jax.control.laws._steady_turn import SteadyTurn
 from sfkd_jax.control.tasks._along_path import Preview, check_preview
 from sfkd_jax.control.wrappers._conditions import ANYWHERE, Conditions
 from sfkd_jax.control.wrappers._estimator import input_error
