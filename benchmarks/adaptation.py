@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks import arguments, stamp, write
 from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
-from benchmarks.recovery import LANE
 from sfkd_jax import build, plants, policy
+from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.plants import equivalent_wind
 from sfkd_jax.scenarios import random_side_forces
 
@@ -128,11 +128,11 @@ def drive(car, system, scenes, keys):
     controller, params, knows = system
     if knows:
         scenes = scenes._replace(observed_envs=scenes.envs)
-    episodes = jax.jit(jax.vmap(driving(car.step, controller, params)))(scenes, keys)
+    episodes = jax.jit(jax.vmap(driving(car, controller, params)))(scenes, keys)
     lateral = np.asarray(episodes.lateral, dtype=np.float64)
     largest = np.abs(lateral).max(axis=1)
     return {
-        "left_the_lane": int(np.sum(~(largest <= LANE))),
+        "left_the_lane": int(np.sum(~(largest <= room_in_lane(car.size)))),
         "largest_mm": round(1e3 * float(largest.max()), 1),
         "rmse_mm": np.round(rmse_mm(lateral[:, SETTLED:]), 3).tolist(),
     }

@@ -45,7 +45,7 @@ def drive():
 
     def episode(name, record):
         controller, params, _ = systems[name]
-        run = driving(plant.step, controller, params, record=record)
+        run = driving(plant, controller, params, record=record)
         return jax.jit(run)(scene, key)
 
     def force(envs):

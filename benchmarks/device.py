@@ -27,8 +27,6 @@ from sfkd_jax import evaluation, scenarios
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
-NOISE = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-"""Standard deviations of the sensors, in the order of the states."""
 FEW = 300
 """Samples of each of several vehicles."""
 DEFAULTS = {
@@ -82,16 +80,21 @@ def family(plant, name, duration, **options):
     )
 
 
-def driving(step, controller, params, **options):
-    """(scenario, key) -> an episode, through the sensors."""
-    options = {"dt": PERIOD, "horizon": HORIZON, "observation_noise": NOISE} | options
-    return partial(evaluation.simulate, step, controller, params, **options)
+def driving(plant, controller, params, **options):
+    """(scenario, key) -> an episode of a vehicle, through its sensors."""
+    options = {
+        "dt": PERIOD,
+        "horizon": HORIZON,
+        "observation_noise": plant.sensor_noise,
+        "size": plant.size,
+    } | options
+    return partial(evaluation.simulate, plant.step, controller, params, **options)
 
 
 def fresh_episodes(policy, scenario, duration):
     """(keys) -> distances from the path of episodes on roads of their own."""
     sample = family(policy.vehicle, scenario, duration)
-    drive = driving(policy.vehicle.step, policy.controller, policy.params)
+    drive = driving(policy.vehicle, policy.controller, policy.params)
 
     def one(key):
         road_key, run_key = jax.random.split(key)

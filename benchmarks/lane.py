@@ -11,6 +11,7 @@ measured again.
 
 import json
 import time
+from functools import partial
 from itertools import product
 
 import jax
@@ -51,8 +52,7 @@ class Car:
     def system(self, name):
         """A controller of scenes, whose params are those of the policy."""
         if name == "lane":
-            length, width = (2.0 * half for half in scenarios.CAR)
-            return self.policy.in_lane(car=(length, width))
+            return self.policy.in_lane()
         task = control.path_tracking(
             models.physics(self.plant.step),
             control.tracking_cost(dt=PERIOD),
@@ -62,7 +62,7 @@ class Car:
             control_high=self.plant.control_high,
         )
         nothing = jnp.zeros((IN_VIEW, 2)), jnp.zeros(IN_VIEW), jnp.zeros(IN_VIEW)
-        clear = control.constrained(task, too_near, nothing)
+        clear = control.constrained(task, partial(too_near, self.plant.size), nothing)
         planner = control.mppi(clear, num_samples=self.samples, horizon=HORIZON)
         free = Controller(planner.init, lambda _, *rest: planner.act({}, *rest))
         return on_road(self.policy.guard(free) if name.endswith(GUARDED) else free)
@@ -72,7 +72,7 @@ class Car:
         # The oracle claims nothing.
         record = {"corridor": lambda info: info["corridor"]} if name != "oracle" else {}
         episode = driving(
-            self.plant.step, self.system(name), self.policy.params, record=record
+            self.plant, self.system(name), self.policy.params, record=record
         )
 
         def run(scenario, key):
@@ -109,12 +109,12 @@ class Car:
         return drive
 
 
-def too_near(data, state, action, target, at):
-    """How much nearer than `MARGIN` a planned state is to the circles in view [m]."""
+def too_near(size, data, state, action, target, at):
+    """How much nearer than `MARGIN` a car of this size is to the circles in view [m]."""
     position, radius, present = data
     seen = circles(position, radius)._replace(present=present > 0.5)
     direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
-    apart = clearance(seen, state[:2], direction=direction, half=scenarios.CAR)
+    apart = clearance(seen, state[:2], direction=direction, half=size.half)
     return jnp.maximum(MARGIN - apart, -1e3)
 
 
@@ -175,7 +175,7 @@ def counted(car, made):
     nearest = gap.min(axis=1)
     far = np.abs(made["lateral"])
     claim = made["corridor"]
-    side = np.abs(made["middle"]) + scenarios.CAR[1]
+    side = np.abs(made["middle"]) + car.plant.size.half[1]
     return {
         "runs": len(gap),
         "collisions": int((nearest < 0.0).sum()),

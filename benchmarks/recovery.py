@@ -18,9 +18,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from benchmarks import arguments, device, stamp, write
-from benchmarks.device import CARS, HORIZON, NOISE, PERIOD
+from benchmarks.device import CARS, HORIZON, PERIOD
 from sfkd_jax import control, geometry, plants, scenarios
-from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
+from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.geometry import LATERAL, wrap_angle
 from sfkd_jax.types import Controller
 
@@ -44,8 +44,6 @@ DEPARTED = 2.0
 """Distance from the path that counts as a departure [m]."""
 BACK = 0.3
 """Distance [m] and heading error [rad] below which a car is back."""
-LANE = LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
-"""Distance from the path at which a car leaves its lane [m]."""
 KINDS = (
     "law",  # the law + ν
     "worst",  # ν at its limit, outwards
@@ -116,7 +114,8 @@ class Car:
         self.step = getattr(plants, name)(dt=TICK, substeps=1).step
         self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
         self.states = len(self.loaded.vehicle.state_names)
-        self.noise = np.asarray(NOISE[: self.states], np.float32)
+        self.noise = np.asarray(self.loaded.vehicle.sensor_noise, np.float32)
+        self.room = room_in_lane(self.loaded.vehicle.size)
         # The loaded controller needs no request.
         self.policy = self.program(lambda _: self.loaded.controller)
         self.guarded = self.program(partial(self.asking, guard=True))
@@ -619,7 +618,7 @@ def planner_rows(car, most):
             worst = distance(made).max(axis=1)
             found = claimed(made, car.corridor)
             found["inside"] = shown((worst <= car.corridor).mean(), 4)
-            found["left_the_lane"] = int((worst > LANE).sum())
+            found["left_the_lane"] = int((worst > car.room).sum())
             yield f"planner {label}: {way}", found
 
 

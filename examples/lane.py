@@ -59,6 +59,7 @@ def compile_drive(policy):
             dt=plant.dt,
             horizon=20,
             observation_noise=sensor_noise,
+            size=plant.size,
             record=RECORDED,
         )
 
@@ -112,7 +113,7 @@ def main(runs=1, seed=0, vehicle="dynamic", film="lane.gif"):
 
     scene = replace_obstacles(draw_scene(keys[0]), OBSTACLES_OF_THE_FILM)
     episode = drive(scene, keys[0])
-    picture = films.LaneFilm(scene, episode, dt=plant.dt, car=scenarios.CAR)
+    picture = films.LaneFilm(scene, episode, dt=plant.dt, car=plant.size.half)
     films.write(Path(film), picture)
 
     summary = summarise(stacked, policy.certificate["corridor"]["corridor_m"])

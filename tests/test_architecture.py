@@ -43,7 +43,7 @@ ARROWS = {
     "policy": PARTS | {"build", "certification", "settings", "store"},
     "export": CORE | {"build", "policy", "settings", "store"},
     "adapters": PLANT | {"build"},
-    "report": {"evaluation", "store"},
+    "report": {"build", "evaluation", "plants", "store"},
     "__init__": {"export", "geometry", "policy", "store"},
 }
 ARROWS |= {"experiment": set(ARROWS)}

@@ -31,7 +31,7 @@ GRAVITY = 9.81
 POSE = slice(0, 3)
 """Entries of the pose (p_x [m], p_y [m], yaw [rad]) in a state."""
 BODY = slice(3, None)
-"""Entries of the body state: v [m/s], then (v_y [m/s], yaw rate [rad/s], steering)."""
+"""Entries of the body state: v [m/s], then the other states of the vehicle."""
 
 
 class Space(NamedTuple):

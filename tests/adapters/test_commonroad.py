@@ -165,7 +165,7 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
     )
     episode = run(jax.random.key(0))
     batch = jax.tree.map(lambda leaf: leaf[None], episode)
-    scores = evaluation.score(batch, dt=car.dt)
+    scores = evaluation.score(batch, dt=car.dt, size=car.size)
     assert not scores["departures"].any()
     assert float(episode.progress[-1]) > 45.0
     assert np.abs(episode.states[:, 2]).max() > 0.05

@@ -27,6 +27,8 @@ SETTINGS = {
     "control_high": PLANT.control_high,
     "env_low": ENV_LOW,
     "env_high": ENV_HIGH,
+    "sensor_noise": PLANT.sensor_noise,
+    "model_error": (1e-3, 3e-4, 3e-3),
 }
 HORIZON = 4
 

@@ -130,7 +130,13 @@ def adaptive():
     law, (model, params) = any_law(), path_model()
     planner = around_law(with_offset(model), law)
     adaptation = control.Adaptation(
-        inner=planner, model=model, law=law, **LIMITS, **BOX
+        inner=planner,
+        model=model,
+        law=law,
+        sensor_noise=PLANT.sensor_noise,
+        model_error=(1e-3, 3e-4, 3e-3),
+        **LIMITS,
+        **BOX,
     )
     conditions = control.Conditions(env=(BOX["env_low"], BOX["env_high"]))
     return gated(adaptation.controller(), model, law, conditions), params

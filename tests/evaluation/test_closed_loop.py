@@ -92,7 +92,8 @@ def test_lateral_deviation_and_progress_are_those_of_the_path():
 
 def test_the_oracle_drives_better_than_the_nominal_model_and_predicts_exactly():
     scores = [
-        evaluation.score(episodes(step), dt=DT) for step in (PLANT.step, PLANT.nominal)
+        evaluation.score(episodes(step), dt=DT, size=PLANT.size)
+        for step in (PLANT.step, PLANT.nominal)
     ]
     assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
     assert np.all(scores[0]["rmse_m"] < 0.1)

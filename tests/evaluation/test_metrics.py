@@ -12,6 +12,7 @@ from sfkd_jax.evaluation.formats import DASH
 from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Recording, switches
 
 DT, STEPS = 0.1, 200
+CAR_SIZE = (4.5, 2.0)
 TIME = np.arange(1, STEPS + 1) * DT
 MEASURED = [metric for metric in METRICS if metric.measure]
 SHOWN = [metric for metric in METRICS if metric.label]
@@ -60,7 +61,7 @@ def episode(lateral, steering=0.0, states=None, ess=1.0, healthy=True, near=np.i
 
 def measured(name, lateral, **changes):
     """A metric of one episode."""
-    return score(episode(lateral, **changes), dt=DT)[name][0]
+    return score(episode(lateral, **changes), dt=DT, size=CAR_SIZE)[name][0]
 
 
 def test_a_sinusoid_has_the_rmse_of_a_sinusoid():
@@ -123,13 +124,13 @@ def batch():
 
 def made(seed=0):
     about = {"system": "sfkd", "scenario": "s3", "seeds": [seed]}
-    return row(score(batch(), dt=DT), about)
+    return row(score(batch(), dt=DT, size=CAR_SIZE), about)
 
 
 @pytest.mark.parametrize("metric", MEASURED, ids=lambda metric: metric.name)
 def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
     joined = batch()
-    values = score(joined, dt=DT)[metric.name]
+    values = score(joined, dt=DT, size=CAR_SIZE)[metric.name]
     assert values.shape == (len(LEVELS),)
     assert metric.pool
     assert BY_NAME[metric.name] is metric
@@ -137,7 +138,7 @@ def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
         alone = jax.tree.map(lambda leaf, k=k: leaf[k : k + 1], joined)
         parts = {one: getattr(alone, one) for one in ("lateral", "states", "controls")}
         named = {name: alone.signals[name] for name in metric.records}
-        run = Recording(dt=DT, signals=named, **parts)
+        run = Recording(dt=DT, size=CAR_SIZE, signals=named, **parts)
         np.testing.assert_array_equal(metric.measure(run), [value])
     for entry in (made(), pool([made(0), made(1)])):
         json.dumps(entry[metric.name], allow_nan=False)
@@ -146,7 +147,10 @@ def test_a_metric_measures_episodes_one_by_one_by_the_signals_it_names(metric):
 @pytest.mark.parametrize("name", EXPECTED)
 def test_a_metric_of_known_episodes_is_exact_and_pools_as_stated(name):
     per_episode, of_row, of_seeds = EXPECTED[name]
-    pooled, values = pool([made(0), made(1)]), score(batch(), dt=DT)[name]
+    pooled, values = (
+        pool([made(0), made(1)]),
+        score(batch(), dt=DT, size=CAR_SIZE)[name],
+    )
     np.testing.assert_allclose(values, per_episode, rtol=1e-12)
     for entry, expected in ((made(), of_row), (pooled, of_seeds)):
         value = BY_NAME[name].value(entry)

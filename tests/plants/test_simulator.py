@@ -113,8 +113,8 @@ def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path, monkeypatch
     chosen = settings(*words.split())
     assert (chosen.vehicle.dt, chosen.vehicle.wheelbase) == (0.1, 5.0)
     assert chosen.environment.names == ("grip [-]", "side force [kN]")
-    noise = chosen.sensors(("yaw_rate", "p_x", "load"))
-    assert noise == (0.002, 0.015, 0.0)  # by name, in any order
+    noise = chosen.sensors(plants.own(state_names=("yaw_rate", "p_x", "load", "v")))
+    assert noise == (0.002, 0.015, 0.0, 0.03)  # by name, in any order
     runs = data.ensure_dataset(chosen)[0].train
     car = highway.make()
     for state, control, env, after in zip(

@@ -88,7 +88,12 @@ def write_run(run, *, episodes=True, **changes):
     """A run directory; `results=None` leaves results.json out."""
     run.mkdir(parents=True, exist_ok=True)
     ahead = list(range(1, 21))
-    settings = {"experiment": "s3", "seed": 0, "model": {"system": "sfkd"}}
+    settings = {
+        "experiment": "s3",
+        "seed": 0,
+        "model": {"system": "sfkd"},
+        "vehicle": {"name": "kinematic"},
+    }
     systems = ("sfkd", "measured"), ("nominal", "none"), ("oracle", "measured")
     rows = [row(*one) for one in systems]
     for one, size in zip(rows, (0.05, 2.0, 0.02) if episodes else (), strict=False):

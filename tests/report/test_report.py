@@ -152,7 +152,7 @@ def test_the_certificate_is_in_words_and_numbers_that_never_round_down(run_page)
         "| 0.1431 | measured, unsigned |",
         "| One-step error d̄ [latent] | 0.0123 | measured, unsigned |",
         "| Asymptotic bound d̄ / (1 − α) [latent] | 0.1812 | proved from d̄ |",
-        "| env: side wind [m/s] | −8 | 8 |",
+        "| env: lateral wind [m/s] | −8 | 8 |",
         "| 8 to 10.5 |",
         "| command | python -m sfkd_jax.train |",
     ):

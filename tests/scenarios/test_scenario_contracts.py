@@ -1,6 +1,6 @@
 """The contract of every scenario family: shapes, randomness, arrays, and the box of e."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +93,7 @@ def test_obstacles_stand_as_far_apart_as_asked_and_are_seen_when_the_car_is_near
 
 def test_the_clearance_of_a_car_is_that_of_its_box():
     obstacles = circles(jnp.asarray([[5.0, 0.0]]), 0.8)
-    near = jit(scenarios.car_clearance)
+    near = jit(partial(scenarios.car_clearance, size=(4.5, 2.0)))
     ahead, across = jnp.zeros(4), jnp.asarray([0.0, 0.0, np.pi / 2, 9.0])
     assert near(obstacles, ahead) == pytest.approx(5.0 - 2.25 - 0.8, abs=1e-4)
     assert near(obstacles, across) == pytest.approx(5.0 - 1.0 - 0.8, abs=1e-4)

@@ -17,8 +17,8 @@ PROCESS = os.getpid()
 """The process that imported this file and started jax; a forked one inherits this."""
 VIEW = 30.0
 """Half width of the view around the car [m]."""
-CAR = np.asarray([[2.25, 0.9], [2.25, -0.9], [-2.25, -0.9], [-2.25, 0.9]])
-"""Corners of the drawn car ahead and to the left of its centre [m]."""
+CORNERS = np.asarray([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+"""Of a car, ahead and to the left of its centre, in shares of half its size."""
 
 
 def register_gymnasium() -> None:
@@ -168,7 +168,8 @@ def _image(
     axes.plot(*np.stack(driven).T, color="C0", linewidth=1.5)
     cos = np.cos(state[2])
     sin = np.sin(state[2])
-    corners = state[:2] + CAR @ np.asarray([[cos, sin], [-sin, cos]])
+    turn = np.asarray([[cos, sin], [-sin, cos]])
+    corners = state[:2] + (CORNERS * task.plant.size.half) @ turn
     axes.fill(*corners.T, "C0", alpha=0.6)
     axes.set_xlim(state[0] - VIEW, state[0] + VIEW)
     axes.set_ylim(state[1] - 0.75 * VIEW, state[1] + 0.75 * VIEW)

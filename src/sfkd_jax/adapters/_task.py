@@ -17,7 +17,6 @@ from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
 from sfkd_jax.scenarios import (
-    CAR,
     Course,
     Family,
     Scenario,
@@ -290,9 +289,11 @@ class LaneTask(DrivingTask):
     def _outside(self, road: Scenario, moment: Moment) -> Bool[Array, ""]:
         """Return whether the car touches an edge of the lane or an obstacle."""
         course = _course(road)
-        side = moment.lateral * jnp.asarray([1.0, -1.0]) + CAR[1]
+        size = self.plant.size
+        side = moment.lateral * jnp.asarray([1.0, -1.0]) + 0.5 * size.width
         room = jnp.min(_edges(course, moment.progress) - side)
-        return (room < 0.0) | (car_clearance(course.obstacles, moment.state) < 0.0)
+        gap = car_clearance(course.obstacles, moment.state, size=size)
+        return (room < 0.0) | (gap < 0.0)
 
     def situation(self, road: Scenario, moment: Moment) -> tuple[State, Any, Any]:
         """Return state, environment and scene, what a controller in a lane takes."""

@@ -30,6 +30,15 @@ REFERENCE_PLANNERS: dict[str, Any] = {
     "cem": {"num_samples": 100, "iterations": 3, "elites": 10},
 }
 """Further settings of such a planner, by its name."""
+MODEL_ERROR = {
+    "e_y": 1e-3,
+    "e_psi": 3e-4,
+    "v": 3e-3,
+    "v_y": 3e-3,
+    "yaw_rate": 1.5e-3,
+    "steering": 5e-4,
+}
+"""Standard deviation of one step of the models that ship, by path coordinate."""
 
 
 def build_controller(
@@ -224,6 +233,9 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
     # The filter relates forces to the largest one in E, which the box defines.
     if None in loop.env_box.values():
         raise ValueError("adaptation needs environment.low and environment.high")
+    own = arguments(settings.adaptation, control.Adaptation)
+    own["sensor_noise"] = own["sensor_noise"] or _noise_to_learn_from(loop.plant)
+    own["model_error"] = own["model_error"] or _error_of_known_states(loop.plant)
     adaptation = control.Adaptation(
         inner=inner,
         # Without the offset, which the filter itself adds.
@@ -232,9 +244,34 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
         estimate_env=loop.estimates_env,
         **_limits(loop.plant),
         **loop.env_box,
-        **arguments(settings.adaptation, control.Adaptation),
+        **own,
     )
     return adaptation.controller()
+
+
+def _noise_to_learn_from(plant: plants.Vehicle) -> tuple[float, ...]:
+    """Return the deviations of the sensors of a vehicle, none of which may be exact."""
+    # A filter weighs what it measures by these: an exact sensor would weigh infinitely.
+    exact = [one.name for one in plant.states if not one.deviation]
+    if exact:
+        raise ValueError(
+            f"adaptation needs the deviation of the sensor of {', '.join(exact)}: "
+            "state it in the vehicle or pass controller.adaptation.sensor_noise"
+        )
+    return plant.sensor_noise
+
+
+def _error_of_known_states(plant: plants.Vehicle) -> tuple[float, ...]:
+    """Return the error of one step of a model, for each path coordinate."""
+    names = [one.name for one in plants.path_states(plant)[3:]]
+    unknown = [name for name in names if name not in MODEL_ERROR]
+    if unknown:
+        raise ValueError(
+            f"adaptation needs the error of the model in {', '.join(unknown)}: pass "
+            f"controller.adaptation.model_error of {', '.join(names)}; open_loop.json "
+            "of the run has them as one_step_rmse"
+        )
+    return tuple(MODEL_ERROR[name] for name in names)
 
 
 def _along_reference(

@@ -13,13 +13,8 @@ from sfkd_jax.ranges import Positive, imported
 from sfkd_jax.settings import OneOf, Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Control, Reference, Space, State, Step
 
-PLANTS = {
-    "kinematic": plants.kinematic,
-    "kinematic_stiff": plants.kinematic_stiff,
-    "dynamic": plants.dynamic,
-    "own": plants.own,
-    "logged": plants.own,
-}
+PLANTS = plants.FACTORIES | {"own": plants.own, "logged": plants.own}
+"""Factories of vehicles by name; the last two are of vehicles from outside."""
 IDENTIFIED = "vehicle"
 """The kind of the file that holds the model of a vehicle that is known from logs."""
 

@@ -82,6 +82,7 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: Sequence[float | Scalar] = (),
+    size: tuple[float, float] | None = None,
     record: Mapping[str, Signal] | None = None,
 ) -> Episode:
     """Simulate one episode.
@@ -105,8 +106,14 @@ def simulate(
         horizon: length of the reference window.
         observation_noise: standard deviation per state. States beyond its length are
             observed without noise; entries beyond the states are not used.
+        size: length and width of the car [m], which a course needs.
         record: more signals of every step, by name, besides those of the metrics.
+
+    Raises:
+        ValueError: a course without the size of the car.
     """
+    if scenario.course is not None and size is None:
+        raise ValueError("obstacles on the road need the size of the car: vehicle.size")
     # Sensors have a key of their own, so that two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     recorded = SIGNALS | dict(record or {})
@@ -137,7 +144,8 @@ def simulate(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
         if scenario.course is not None:
-            info["gap"] = car_clearance(ahead[1], state)
+            assert size is not None
+            info["gap"] = car_clearance(ahead[1], state, size=size)
             if "reference" in info:
                 # The first point of the reference is where the car should be now.
                 reference = info["reference"]
@@ -224,14 +232,14 @@ def disturbed_environment(
 
 def open_loop(
     model: Model, params: Params, trajectories: Trajectory, *, horizon: int
-) -> Float[Array, "horizon 4"]:
+) -> Float[Array, "horizon column"]:
     """Return the RMSE of free-running predictions 1 … horizon steps ahead.
 
     Predictions start at every `horizon`-th step of each trajectory.
 
     The columns are the errors along and across the true heading [m], so that each axis
-    means the same on every trajectory, of the yaw [rad] and of the speed [m/s]. In path
-    coordinates they are 0 and the errors of e_y [m], e_ψ [rad] and the speed [m/s].
+    means the same on every trajectory, of the yaw [rad] and of the body state. In path
+    coordinates they are 0 and the errors of e_y [m], e_ψ [rad] and the body state.
 
     Args:
         model: that predicts.
@@ -241,17 +249,18 @@ def open_loop(
     """
     windows = adjacent_windows(trajectories, length=horizon)
 
-    def squared_errors(window: Trajectory) -> Float[Array, "horizon 4"]:
+    def squared_errors(window: Trajectory) -> Float[Array, "horizon column"]:
         predicted = rollout(model, params, window).free
         true = window.states[1:]
         if not model.along_path:
-            return state_errors(predicted, true)[:, :4] ** 2
+            return state_errors(predicted, true) ** 2
         error = (predicted - true)[:, BODY]
         # A model in path coordinates does not predict the position along the path.
         along = jnp.zeros(error.shape[0])
         lateral = error[:, LATERAL]
         heading = wrap_angle(error[:, HEADING])
-        return jnp.column_stack([along, lateral, heading, error[:, PATH_SPEED]]) ** 2
+        body = error[:, PATH_SPEED:]
+        return jnp.column_stack([along, lateral, heading, body]) ** 2
 
     squares = in_batches(jax.vmap(squared_errors), windows, size=128)
     return jnp.sqrt(jnp.mean(squares, axis=0))

@@ -22,10 +22,9 @@ system [s].
 """
 LANE_HALF_WIDTH = 1.75
 """Half width of the lane that a car has to stay in [m]."""
-VEHICLE_HALF_WIDTH = 0.9
-"""Half width of the car that has to stay in the lane [m].
-
-`scenarios.CAR`, the box that has to keep clear of obstacles, is wider.
+MIRROR = 0.1
+"""Width of a mirror [m]. The body without mirrors has to stay in the lane, and this is
+how committed departures were counted; the whole width has to keep clear of obstacles.
 """
 SWITCH = (0.05, 6.0)
 """Change of friction [-] and of wind [m/s] in a step from which on it is a switch. The
@@ -38,6 +37,7 @@ class Recording(NamedTuple):
 
     Attributes:
         dt: sampling period [s].
+        size: length and width of the car [m].
         lateral: signed distance from the path [m].
         states: x_0 … x_T.
         controls: u_0 … u_{T-1}.
@@ -45,6 +45,7 @@ class Recording(NamedTuple):
     """
 
     dt: float
+    size: tuple[float, float]
     lateral: Float[np.ndarray, "episode time"]
     states: Float[np.ndarray, "episode time_plus_1 state"]
     controls: Float[np.ndarray, "episode time control"]
@@ -79,13 +80,22 @@ def steering_rate(run: Recording) -> np.ndarray:
     return np.mean(np.abs(np.diff(run.controls[..., 0], axis=1)), axis=1) / run.dt
 
 
+def room_in_lane(size: tuple[float, float]) -> float:
+    """Return the deviation up to which a car stays in its lane [m].
+
+    Args:
+        size: length and width of the car [m].
+    """
+    # The side of the car has to stay in the lane, and not only its centre.
+    return LANE_HALF_WIDTH - (0.5 * size[1] - MIRROR)
+
+
 def departed(run: Recording) -> np.ndarray:
     """Return whether the car left its lane, or a state is not finite."""
     # All states count here, also those of the part that is not scored.
     finite = np.all(np.isfinite(run.states), axis=(1, 2))
-    # The side of the car has to stay in the lane, and not only its centre. For a
-    # deviation of NaN the comparison is false.
-    stays = max_deviation(run) + VEHICLE_HALF_WIDTH <= LANE_HALF_WIDTH
+    # For a deviation of NaN the comparison is false.
+    stays = max_deviation(run) <= room_in_lane(run.size)
     return ~finite | ~stays
 
 

@@ -29,10 +29,17 @@ Scores: TypeAlias = dict[str, PerEpisode]
 """One value per episode, by the name of the metric."""
 
 
-def score(episodes: Episode, *, dt: float) -> Scores:
-    """Measure every metric on a batch of episodes."""
+def score(episodes: Episode, *, dt: float, size: tuple[float, float]) -> Scores:
+    """Measure every metric on a batch of episodes.
+
+    Args:
+        episodes: of one system.
+        dt: sampling period [s].
+        size: length and width of the car [m].
+    """
     recording = Recording(
         dt=dt,
+        size=size,
         lateral=np.asarray(episodes.lateral, dtype=np.float64),
         states=np.asarray(episodes.states),
         controls=np.asarray(episodes.controls),

@@ -15,9 +15,9 @@ import numpy as np
 
 from sfkd_jax.evaluation import _measures as measures
 from sfkd_jax.evaluation._measures import LANE_HALF_WIDTH as LANE_HALF_WIDTH
-from sfkd_jax.evaluation._measures import VEHICLE_HALF_WIDTH as VEHICLE_HALF_WIDTH
 from sfkd_jax.evaluation._measures import PerEpisode as PerEpisode
 from sfkd_jax.evaluation._measures import Recording as Recording
+from sfkd_jax.evaluation._measures import room_in_lane as room_in_lane
 from sfkd_jax.evaluation._measures import switches as switches
 from sfkd_jax.evaluation._statistics import summary
 from sfkd_jax.evaluation.formats import (

@@ -22,7 +22,7 @@ from sfkd_jax.experiment import data, laws, runs, stages
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.rollout import fold, on_host, unfold
-from sfkd_jax.scenarios import CAR, COURSES, Scenario
+from sfkd_jax.scenarios import COURSES, Scenario
 from sfkd_jax.settings import arguments, choose, replace
 from sfkd_jax.types import Controller, Key, Params
 
@@ -209,7 +209,8 @@ class SystemEvaluation:
             self.controller,
             horizon=settings.controller.horizon,
             dt=plant.dt,
-            observation_noise=settings.sensors(plant.state_names),
+            observation_noise=settings.sensors(plant),
+            size=plant.size,
         )
         self._simulate = _over_episodes(simulate)
 
@@ -253,7 +254,8 @@ class SystemEvaluation:
             envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
             scenarios = scenarios._replace(envs=envs)
         episode = self._simulate(self.params, scenarios, episodes.keys)
-        return episode, evaluation.score(episode, dt=self._plant.dt)
+        scores = evaluation.score(episode, dt=self._plant.dt, size=self._plant.size)
+        return episode, scores
 
 
 def has_course(settings: Settings) -> bool:
@@ -276,7 +278,7 @@ def _in_lane(
         system.law,
         system.certificate or {},
         horizon=settings.controller.horizon,
-        car=(2.0 * CAR[0], 2.0 * CAR[1]),
+        car=plant.size,
         planner="mppi",
         friction=0,
     )

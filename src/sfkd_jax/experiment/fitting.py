@@ -42,9 +42,10 @@ def train_policy(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     space = measure_space(dataset)
     recorded["space"] = space._asdict()
     # The same model as that of `restore`, for which everything is then compiled.
-    _, model = policy.built(recorded)
+    plant, model = policy.built(recorded)
     if settings.environment.is_known and not settings.logs:
-        names = settings.environment.names or policy.FRICTION_AND_WIND
+        usual = [one.label for one in plant.environment]
+        names = settings.environment.names or usual
         box = in_words(names, dataset.env_low, dataset.env_high)
         store.print_message(f"the model reads e: {box}")
     key = jax.random.fold_in(jax.random.key(settings.seed), 0)

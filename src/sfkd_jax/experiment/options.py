@@ -18,7 +18,7 @@ from sfkd_jax.build import (
 )
 from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
-from sfkd_jax.plants import described
+from sfkd_jax.plants import KNOWN_STATES, Vehicle, described
 from sfkd_jax.policy import CERTIFICATE
 from sfkd_jax.ranges import (
     Bounds,
@@ -33,18 +33,6 @@ from sfkd_jax.ranges import (
 from sfkd_jax.scenarios import DriveClass
 from sfkd_jax.settings import OneOf, Values, arguments, parse, replace, schema, takes
 
-SENSORS = {
-    "p_x": 0.015,
-    "p_y": 0.015,
-    "yaw": 0.002,
-    "v": 0.03,
-    "v_y": 0.02,
-    "yaw_rate": 0.002,
-    "steering": 0.001,
-}
-"""Standard deviations of the measured states, in their units, by name: those of a
-satellite and inertial unit of survey grade.
-"""
 Overrides = dict[str, str | None]
 Seconds = Annotated[float, Interval("(2, inf)")]
 """The length of an episode, whose first two seconds are not scored."""
@@ -194,8 +182,9 @@ class EvaluationSettings:
         seed: of roads, sensors and samplers.
         systems: "self", which is the policy of the run, and reference systems by name.
             With an empty list `train` trains the model and does nothing else.
-        observation_noise: standard deviations by name of the state, by default
-            `SENSORS`. States that are not named are measured exactly.
+        observation_noise: standard deviations by name of the state; None for that which
+            the vehicle states, see `plants.KNOWN_STATES`. Other states are measured
+            exactly.
         side_forces: largest side forces that no model knows [N]; the episodes are
             simulated once more under each.
     """
@@ -204,7 +193,9 @@ class EvaluationSettings:
     episode_s: Seconds = 60.0
     seed: NonNegativeInt = 2026
     systems: Names = ("self", "nominal", "oracle")
-    observation_noise: dict[str, NonNegative] = field(default_factory=SENSORS.copy)
+    observation_noise: dict[str, NonNegative | None] = field(
+        default_factory=partial(dict.fromkeys, KNOWN_STATES)
+    )
     side_forces: Numbers = ()
 
 
@@ -307,15 +298,18 @@ class Settings:
         """The certificate of the run, whether or not it exists."""
         return self.run_dir / CERTIFICATE
 
-    def sensors(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        """Return the noise of the sensors of these states."""
+    def sensors(self, plant: Vehicle) -> tuple[float, ...]:
+        """Return the standard deviations of the sensors of a vehicle, one a state."""
         noise = self.evaluation.observation_noise
-        if unknown := set(noise) - {*names, *SENSORS}:
+        names = plant.state_names
+        # Cars of one comparison may have different ones of the known states.
+        if unknown := set(noise) - {*names, *KNOWN_STATES}:
             raise ValueError(
                 f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
                 f"the states of the vehicle are {', '.join(names)}"
             )
-        return tuple(noise.get(name, 0.0) for name in names)
+        asked = {name: value for name, value in noise.items() if value is not None}
+        return tuple(asked.get(one.name, one.deviation) for one in plant.states)
 
     @property
     def logs(self) -> LogSettings | None:

@@ -234,7 +234,7 @@ def _measure_corridor(
         trained.model,
         trained.params,
         trained.law,
-        settings.sensors(plant.state_names),
+        settings.sensors(plant),
     )
     corridor = certify_corridor(
         loop,

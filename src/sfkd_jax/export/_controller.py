@@ -71,7 +71,7 @@ def write_controller(
     *,
     platforms: tuple[str, ...] = ("cpu", "cuda"),
     lane: Annotated[tuple[int, ...], MayBeEmpty()] = (),
-    car: tuple[Positive, Positive] = (4.5, 2.0),
+    car: tuple[Positive, Positive] | None = None,
     iree: bool = False,
     iree_flags: Names = ("--iree-llvmcpu-target-cpu=host",),
 ) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def write_controller(
         platforms: some of `PLATFORMS`, for which the programs are compiled.
         lane: (points of the road, obstacles, predicted steps of each) for a controller
             that drives in a lane; () for one that follows a reference.
-        car: length and width of the car [m], for a lane.
+        car: length and width of the car [m], for a lane; None for those of the vehicle.
         iree: whether to compile for C and C++ as well.
         iree_flags: for iree-compile.
     """
@@ -94,6 +94,7 @@ def write_controller(
         )
     # Everything that can refuse comes before the first file is written.
     ahead = None
+    car = car or trained.vehicle.size
     if lane:
         trained, ahead = in_window(trained, lane, car)
     programs = flat_programs(trained, ahead)

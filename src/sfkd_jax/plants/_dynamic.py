@@ -8,9 +8,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from sfkd_jax.plants._kinematic import CarParameters
+from sfkd_jax.plants._variables import states_of
 from sfkd_jax.plants._vehicle import (
-    CONTROL_HIGH,
-    CONTROL_LOW,
+    CAR_CONTROLS,
     Vehicle,
     nominal_derivative,
     resistance,
@@ -109,13 +109,12 @@ def dynamic(
         name="dynamic",
         dt=dt,
         wheelbase=length,
-        state_names=("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering"),
+        states=states_of(("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering")),
+        controls=CAR_CONTROLS,
         step=rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
         nominal=_quasi_steady(rk4(bicycle, dt=dt), length, rear_length),
         nominal_derivative=bicycle,
-        control_low=CONTROL_LOW,
-        control_high=CONTROL_HIGH,
         wind_force=wind_force,
     )
 
@@ -144,7 +143,7 @@ def _dynamic_derivative(
 ) -> State:
     """Return dx/dt of `dynamic`."""
     mass = car.shared.mass
-    # In the order of `state_names` of `dynamic`.
+    # In the order of `states` of `dynamic`.
     yaw, speed, side_speed, yaw_rate, steering = (state[k] for k in range(2, 7))
     grip = env[0] * GRAVITY
     drive = _acceleration(control, speed, grip)

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from sfkd_jax.plants._variables import states_of
 from sfkd_jax.plants._vehicle import (
-    CONTROL_HIGH,
-    CONTROL_LOW,
+    CAR_CONTROLS,
     Vehicle,
     nominal_derivative,
     resistance,
@@ -114,13 +114,12 @@ def kinematic(
         name="kinematic" if stiffness_by_friction else "kinematic_stiff",
         dt=dt,
         wheelbase=car.length,
-        state_names=("p_x", "p_y", "yaw", "v"),
+        states=states_of(("p_x", "p_y", "yaw", "v")),
+        controls=CAR_CONTROLS,
         step=rk4(derivative, dt=dt, substeps=substeps),
         derivative=derivative,
         nominal=rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
-        control_low=CONTROL_LOW,
-        control_high=CONTROL_HIGH,
         wind_force=wind_force,
     )
 

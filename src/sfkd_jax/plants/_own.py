@@ -9,6 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax.plants._simulator import Make, pool_of
+from sfkd_jax.plants._variables import (
+    ACCELERATION,
+    SPEED_COMMAND,
+    STEERING,
+    states_of,
+)
 from sfkd_jax.plants._vehicle import Vehicle, nominal_derivative, rk4
 from sfkd_jax.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
@@ -30,7 +36,9 @@ def own(
     Without a step a model of the vehicle can be learned and planned with, but the
     vehicle cannot be simulated. Its nominal model is the textbook kinematic bicycle on
     (p_x, p_y, yaw, v), with the centre of mass in the middle. Further states are
-    constant in that model.
+    constant in that model. States of `KNOWN_STATES` have the unit and the sensor of
+    that table; of others the unit is unknown, and they are observed exactly unless
+    `evaluation.observation_noise` says otherwise.
 
     Args:
         dt: sampling period [s].
@@ -59,19 +67,24 @@ def own(
             "vehicle.control_low and vehicle.control_high must be two numbers each, "
             "as in [-0.4,-3.0]"
         )
+    controls = (STEERING, SPEED_COMMAND if speed_loop else ACCELERATION)
+    if not without_limits:
+        controls = tuple(
+            one._replace(low=low, high=high)
+            for one, low, high in zip(controls, control_low, control_high, strict=True)
+        )
     # Logs do not tell where the centre of mass is. It is taken to be in the middle.
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase, states=len(state_names))
     return Vehicle(
         name="own",
         dt=dt,
         wheelbase=wheelbase,
-        state_names=tuple(state_names),
+        states=states_of(state_names),
+        controls=controls,
         # `_no_step` fails only when it is called. Learning and planning do not call it.
         step=_no_step if step is None else step,
         nominal=rk4(bicycle, dt=dt),
         nominal_derivative=bicycle,
-        control_low=tuple(control_low),
-        control_high=tuple(control_high),
         wind_force=wind_force,
         speed_loop=speed_loop,
         simulated=step is not None,

@@ -13,13 +13,25 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax.geometry import PathFeedback, closed_loop
+from sfkd_jax.plants._variables import (
+    ACCELERATION,
+    CAR_SIZE,
+    FRICTION_AND_WIND,
+    SPEED_COMMAND,
+    STEERING,
+    ControlVariable,
+    EnvironmentVariable,
+    Size,
+    StateVariable,
+)
 from sfkd_jax.rollout import runge_kutta
 from sfkd_jax.types import GRAVITY, Control, Environment, Scalar, State, Step
 
-CONTROL_LOW = (-0.5, -6.0)
-"""Lower limits of the steering [rad] and of the acceleration [m/s²]."""
-CONTROL_HIGH = (0.5, 3.0)
-"""Upper limits of the same."""
+CAR_CONTROLS = (
+    STEERING._replace(low=-0.5, high=0.5),
+    ACCELERATION._replace(low=-6.0, high=3.0),
+)
+"""The controls of both benchmark cars."""
 SPEED_RANGE = (0.0, 25.0)
 """Range of speed commands and of reference speeds [m/s]."""
 LARGEST_CURVATURE = 0.2
@@ -33,14 +45,15 @@ class Vehicle(NamedTuple):
         name: of the plant.
         dt: sampling period [s].
         wheelbase: [m].
-        state_names: pose first, then the body state.
+        states: pose first, then the body state.
+        controls: steering first. Without limits only if there is no step.
         step: (x, u, e) -> x one sampling period later.
         nominal: the same for the textbook kinematic bicycle, which knows neither
             friction nor wind.
         nominal_derivative: dx/dt of that bicycle, for models that add to it.
-        control_low: lower limits of the actuators.
-        control_high: upper limits of the actuators.
         wind_force: c_w of `side_force` [N s²/m²].
+        environment: the entries of e.
+        size: of the body.
         speed_loop: whether u_2 is a speed command [m/s] instead of an acceleration
             [m/s²].
         simulated: whether there is a step; False for a vehicle that is known from logs
@@ -52,16 +65,37 @@ class Vehicle(NamedTuple):
     name: str
     dt: float
     wheelbase: float
-    state_names: tuple[str, ...]
+    states: tuple[StateVariable, ...]
+    controls: tuple[ControlVariable, ...]
     step: Step
     nominal: Step
     nominal_derivative: Step
-    control_low: tuple[float, ...]
-    control_high: tuple[float, ...]
     wind_force: float
+    environment: tuple[EnvironmentVariable, ...] = FRICTION_AND_WIND
+    size: Size = CAR_SIZE
     speed_loop: bool = False
     simulated: bool = True
     derivative: Step | None = None
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return tuple(one.name for one in self.states)
+
+    @property
+    def sensor_noise(self) -> tuple[float, ...]:
+        """Standard deviations of the sensors, one a state; 0 of an exact one."""
+        return tuple(one.deviation for one in self.states)
+
+    @property
+    def control_low(self) -> tuple[float, ...]:
+        """Lower limits of the actuators; () if they are unknown."""
+        return tuple(one.low for one in self.controls if one.low is not None)
+
+    @property
+    def control_high(self) -> tuple[float, ...]:
+        """Upper limits of the actuators; () if they are unknown."""
+        return tuple(one.high for one in self.controls if one.high is not None)
 
 
 def side_force(wind: Scalar, *, wind_force: float) -> Scalar:
@@ -196,8 +230,10 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
         step=closed_loop_of(vehicle.step),
         nominal=closed_loop_of(vehicle.nominal),
         nominal_derivative=closed_loop_of(vehicle.nominal_derivative),
-        control_low=(vehicle.control_low[0], SPEED_RANGE[0]),
-        control_high=(vehicle.control_high[0], SPEED_RANGE[1]),
+        controls=(
+            vehicle.controls[0],
+            SPEED_COMMAND._replace(low=SPEED_RANGE[0], high=SPEED_RANGE[1]),
+        ),
         speed_loop=True,
     )
 
@@ -237,17 +273,58 @@ def along_path(
         # derivative is therefore the difference quotient over a step.
         return (nominal(state, control, env) - state) / vehicle.dt
 
+    controls = path_controls(vehicle)
+    perturbations = (
+        one._replace(low=-limit, high=limit)
+        for one, limit in zip(controls[:2], largest, strict=True)
+    )
     return vehicle._replace(
-        state_names=("p_x", "p_y", "yaw", "e_y", "e_psi", *vehicle.state_names[3:]),
+        states=path_states(vehicle),
+        # Limits of w to draw from. The loop itself clips only the control u.
+        controls=(*perturbations, *controls[2:]),
         step=closed_loop(vehicle.step, law, *limits),
         derivative=None,
         nominal=nominal,
         nominal_derivative=nominal_derivative,
-        # Limits of w to draw from. The loop itself clips only the control u.
-        control_low=(
-            *(-limit for limit in largest),
-            -LARGEST_CURVATURE,
-            SPEED_RANGE[0],
-        ),
-        control_high=(*largest, LARGEST_CURVATURE, SPEED_RANGE[1]),
     )
+
+
+def path_states(vehicle: Vehicle) -> tuple[StateVariable, ...]:
+    """Return the states of a vehicle with a path-following law around it.
+
+    e_y has the deviation of a position, e_ψ that of the yaw.
+    """
+    position, _, yaw = pose = vehicle.states[:3]
+    errors = (position._replace(name="e_y"), yaw._replace(name="e_psi"))
+    return (*pose, *errors, *vehicle.states[3:])
+
+
+def path_controls(vehicle: Vehicle) -> tuple[ControlVariable, ...]:
+    """Return the inputs w of a vehicle with a path-following law; ν has no limits."""
+    added = (
+        ControlVariable(f"{control.name} added", control.unit)
+        for control in vehicle.controls
+    )
+    curvature = ControlVariable(
+        "curvature", "1/m", -LARGEST_CURVATURE, LARGEST_CURVATURE
+    )
+    return (*added, curvature, ControlVariable("v_ref", "m/s", *SPEED_RANGE))
+
+
+def axes(vehicle: Vehicle, *, along_path: bool) -> dict[str, list[str]]:
+    """Return names with units of what a model of the vehicle reads.
+
+    Args:
+        vehicle: without a law around it.
+        along_path: whether the model is about path coordinates.
+
+    Returns:
+        The axes of the body "state", of the "control" and of "env".
+    """
+    states = path_states(vehicle) if along_path else vehicle.states
+    controls = path_controls(vehicle) if along_path else vehicle.controls
+    return {
+        "state": [one.label for one in states[3:]],
+        "control": [one.label for one in controls],
+        "env": [one.label for one in vehicle.environment],
+    }

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from sfkd_jax import build, store
 from sfkd_jax.control import behind, requesting
 from sfkd_jax.geometry import relative, shifted
-from sfkd_jax.policy._description import FRICTION_AND_WIND as FRICTION_AND_WIND
 from sfkd_jax.policy._description import describe, interface_of
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
 from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
@@ -100,14 +99,15 @@ class Policy(TrainedModel):
         return _entrance(behind(shielded), self)
 
     def in_lane(
-        self, *, car: tuple[float, float] = (4.5, 2.0), planner: str = "mppi"
+        self, *, car: tuple[float, float] | None = None, planner: str = "mppi"
     ) -> Controller:
         """Return a controller that drives in a lane, round obstacles, see `InLane`.
 
         Its `act` takes (`Lane`, `Obstacles`) in place of the reference.
 
         Args:
-            car: length and width [m]; its middle is the observed position.
+            car: length and width [m], by default those of the vehicle; its middle is
+                the observed position.
             planner: name of the planner that searches for a reference, "mppi" or "cem".
 
         Raises:
@@ -126,7 +126,7 @@ class Policy(TrainedModel):
                 law,
                 certificate,
                 horizon=self.interface["horizon"],
-                car=car,
+                car=car or self.vehicle.size,
                 planner=planner,
                 friction=friction[0] if friction else None,
             )

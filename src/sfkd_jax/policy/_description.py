@@ -6,21 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import build
+from sfkd_jax.plants import axes
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
-
-UNITS = {
-    "p_x": "[m]",
-    "p_y": "[m]",
-    "yaw": "[rad]",
-    "v": "[m/s]",
-    "v_y": "[m/s]",
-    "yaw_rate": "[rad/s]",
-    "steering": "[rad]",
-}
-"""Units of the states of the vehicles of this package."""
-FRICTION_AND_WIND = ["friction [-]", "lateral wind [m/s]"]
-"""Names of the entries of e, unless the settings or the certificate name others."""
 
 
 def interface_of(
@@ -29,22 +17,20 @@ def interface_of(
     """Return names, units and limits of controls, observation, e and reference."""
     vehicle = trained.vehicle
     environment = trained.settings["environment"]
-    # With a speed loop the second control is the speed that the loop is given.
-    second = "speed command [m/s]" if vehicle.speed_loop else "acceleration [m/s^2]"
-    names = ("steering [rad]", second)
-    limits = zip(names, vehicle.control_low, vehicle.control_high, strict=True)
     # An environment that was measured in logs has names of its own.
     boxes = (certificate or {}).get("boxes", {})
     columns = boxes.get("names", {}).get("env")
+    usual = [one.label for one in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
         "horizon": build.controller_horizon(trained.settings["controller"]),
         "controls": [
-            {"name": name, "low": low, "high": high} for name, low, high in limits
+            {"name": one.label, "low": one.low, "high": one.high}
+            for one in vehicle.controls
         ],
         "observation": list(vehicle.state_names),
         "environment": {
-            "names": columns or environment.get("names") or FRICTION_AND_WIND,
+            "names": columns or environment.get("names") or usual,
             "low": list(environment["low"]),
             "high": list(environment["high"]),
         },
@@ -57,7 +43,7 @@ def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
     vehicle = trained.vehicle
     interface = interface_of(trained, certificate)
     frame = "along a path" if trained.model.along_path else "in the world"
-    states = [f"{name} {UNITS.get(name, '')}".strip() for name in vehicle.state_names]
+    states = [one.label for one in vehicle.states]
     controls = in_words(
         [control["name"] for control in interface["controls"]],
         [control["low"] for control in interface["controls"]],
@@ -72,27 +58,21 @@ def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
         f"environment, {source}: {in_words(box['names'], box['low'], box['high'])}",
     ]
     if certificate:
-        body = states[3:]
-        lines.append(_certified_box(certificate, body, trained.model.along_path))
+        lines.append(_certified_box(certificate, trained))
         lines.extend(_certified_facts(certificate, box["names"]))
     else:
         lines.append("no certificate: nothing is proved, nothing measured")
     return "\n  ".join(lines)
 
 
-def _certified_box(document: dict[str, Any], body: list[str], along_path: bool) -> str:
-    """Return the line about the states for which the certificate is stated.
-
-    Args:
-        document: the certificate.
-        body: names of the body state.
-        along_path: whether the states are path coordinates.
-    """
+def _certified_box(document: dict[str, Any], trained: TrainedModel) -> str:
+    """Return the line about the states for which the certificate is stated."""
     boxes = document["boxes"]
     low, high = boxes["state"]
-    if not along_path:
-        return f"certified box: {in_words(body, low, high)}"
-    names = ["e_y [m]", "e_psi [rad]", *body, "curvature [1/m]", "v_ref [m/s]"]
+    named = axes(trained.vehicle, along_path=trained.model.along_path)
+    if not trained.model.along_path:
+        return f"certified box: {in_words(named['state'], low, high)}"
+    names = [*named["state"], *named["control"][2:]]
     # The first two inputs are ν, which is the planner's choice and has no condition.
     inputs_low, inputs_high = boxes["control"]
     limits_low = [*low, *inputs_low[2:]]

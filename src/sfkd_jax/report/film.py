@@ -15,7 +15,6 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.text import Text
 from PIL import Image
 
-from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, VEHICLE_HALF_WIDTH
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
 from sfkd_jax.report.frames import (
@@ -33,8 +32,8 @@ from sfkd_jax.report.frames import (
 from sfkd_jax.report.lane_film import LaneFilm as LaneFilm
 from sfkd_jax.report.tables import NO_MODEL
 
-LANE = LANE_HALF_WIDTH - VEHICLE_HALF_WIDTH
-"""Deviation at which a car leaves its lane [m]."""
+_LOST = 0.85
+"""Larger deviations do not set the scale of a film [m]."""
 _HALF = 3.4
 """Half width of the road as drawn [m]."""
 _SPACING = 7.6
@@ -54,7 +53,9 @@ _LARGEST_FACTOR = 10
 _COLOURS = 48
 """Number of colours of the file."""
 _CAR = np.array([[2.4, 1.8, -2.2, -2.2, 1.8], [0.0, 0.85, 0.85, -0.85, -0.85]])
-"""Corners of a car in its frame [m]."""
+"""Corners of the drawing of a car [m]. It shows where the car points, and is the same
+for all of them: files of episodes do not say how large theirs is.
+"""
 
 
 def film_of(
@@ -135,8 +136,8 @@ class Film:
         self.deviations = [car.lateral[0, :last] for car in cars]
         peaks = [float(np.max(np.abs(lateral))) for lateral in self.deviations]
         # A car that leaves its lane would make all others look motionless.
-        shown = [corridor or 0.0, *(peak for peak in peaks if peak <= LANE)]
-        self.largest = max(shown) or LANE
+        shown = [corridor or 0.0, *(peak for peak in peaks if peak <= _LOST)]
+        self.largest = max(shown) or _LOST
         # The same widening for all cars, so that they compare.
         fitting = int(np.clip(_HALF / self.largest, 1, _LARGEST_FACTOR))
         self.factor = factor or fitting

@@ -10,9 +10,11 @@ from typing import Any
 import pandas as pd
 
 from sfkd_jax import store
+from sfkd_jax.build import build_vehicle
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
 from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.plants import axes
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import film_of
@@ -48,22 +50,6 @@ _WRITERS = {
     "upper": formats.upper,
 }
 """How templates/certificate.csv says that a value is written."""
-_CAR = ["speed [m/s]", "lateral speed [m/s]", "yaw rate [rad/s]", "steering [rad]"]
-_BODY = {
-    "state": _CAR,
-    "control": ["steering [rad]", "acceleration [m/s²] or speed [m/s]"],
-    "env": ["friction [-]", "side wind [m/s]"],
-}
-_PATH = _BODY | {
-    "state": ["lateral error [m]", "heading error [rad]", *_CAR],
-    "control": [
-        "steering added [rad]",
-        "acceleration added [m/s²]",
-        "curvature [1/m]",
-        "reference speed [m/s]",
-    ],
-}
-"""Axes of the boxes of a certificate, in the frame of the body and of a path."""
 
 
 def write_report(run_dir: Path) -> dict[str, Any]:
@@ -158,7 +144,7 @@ def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Secti
     rows = results.get("rows")
     add("Closed loop", "results.json", _scores, results)
     add("Episodes", "results.json", _driven, run_dir, half_width, images, rows)
-    add("Certificate", "certificate.json", _certified, certificate)
+    add("Certificate", "certificate.json", _certified, certificate, policy)
     add("Open loop", "open_loop.json", _predicted, run_dir, proof, images)
     add("Training", "metrics.jsonl", _learned, run_dir, images)
     command = dig(results, "config", "command")
@@ -220,7 +206,7 @@ def draw_episodes(
     return parts
 
 
-def _certified(record: dict[str, Any]) -> list[Part]:
+def _certified(record: dict[str, Any], policy: dict[str, Any]) -> list[Part]:
     """Return what holds and on what it rests, then the boxes in which it holds."""
     if not record:
         return []
@@ -232,7 +218,7 @@ def _certified(record: dict[str, Any]) -> list[Part]:
         PROOF,
         record_table("Quantity", quantities, "value", "rests on"),
     ]
-    boxes = _certified_boxes(record)
+    boxes = _certified_boxes(record, policy)
     if boxes:
         parts.append(record_table("Box", boxes, "from", "to"))
     return parts
@@ -250,11 +236,12 @@ def _certified_quantities(record: dict[str, Any]) -> dict[str, list[str]]:
     return quantities
 
 
-def _certified_boxes(record: dict[str, Any]) -> dict[str, list[Any]]:
+def _certified_boxes(
+    record: dict[str, Any], policy: dict[str, Any]
+) -> dict[str, list[Any]]:
     """Return name -> [lower, upper end] of the axes of the boxes of a certificate."""
     boxes = {}
-    axes_of = _PATH if record.get("corridor") else _BODY
-    for box, known in axes_of.items():
+    for box, known in _axes(record, policy).items():
         # Boxes of logged data name their own axes.
         names = dig(record, "boxes", "names", box) or known
         for axis, name in enumerate(names):
@@ -262,6 +249,18 @@ def _certified_boxes(record: dict[str, Any]) -> dict[str, list[Any]]:
             if is_pair(ends):
                 boxes[f"{box}: {name}"] = ends
     return boxes
+
+
+def _axes(record: dict[str, Any], policy: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the names of the axes of every box, those of the vehicle of the policy."""
+    settings = policy.get("config") or {}
+    vehicle = settings.get("vehicle")
+    if not vehicle:
+        return {}
+    # No certificate of another frame has a corridor.
+    named = axes(build_vehicle(vehicle), along_path=bool(record.get("corridor")))
+    environment = dig(settings, "environment", "names")
+    return named | ({"env": environment} if environment else {})
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:

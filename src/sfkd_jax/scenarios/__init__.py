@@ -19,7 +19,6 @@ from sfkd_jax.scenarios._conditions import wet_road as wet_road
 from sfkd_jax.scenarios._drives import DRIVES as DRIVES
 from sfkd_jax.scenarios._drives import DriveClass as DriveClass
 from sfkd_jax.scenarios._drives import random_drive as random_drive
-from sfkd_jax.scenarios._scenarios import CAR as CAR
 from sfkd_jax.scenarios._scenarios import COURSES as COURSES
 from sfkd_jax.scenarios._scenarios import ROADS as ROADS
 from sfkd_jax.scenarios._scenarios import Course as Course

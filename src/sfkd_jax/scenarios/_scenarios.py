@@ -32,8 +32,6 @@ GAP = (40.0, 60.0)
 """Range of the distance from one obstacle to the next [m]."""
 PASSED = 15.0
 """Distance behind the car from which on an obstacle counts as passed [m]."""
-CAR = (2.25, 1.0)
-"""Half of length and width of the car [m]."""
 IN_VIEW = 4
 """Number of obstacles that a controller is shown: those that are passed next."""
 
@@ -111,10 +109,19 @@ def in_view(course: Course, progress: Scalar) -> Obstacles:
     return jax.tree.map(window, obstacles)
 
 
-def car_clearance(obstacles: Obstacles, state: State) -> Scalar:
-    """Return how far a car of size `CAR` is from the nearest obstacle now [m]."""
+def car_clearance(
+    obstacles: Obstacles, state: State, *, size: tuple[float, float]
+) -> Scalar:
+    """Return how far a car is from the nearest obstacle now [m].
+
+    Args:
+        obstacles: as they are now.
+        state: of the car.
+        size: length and width of the car [m].
+    """
     direction = jnp.stack([jnp.cos(state[2]), jnp.sin(state[2])])
-    return jnp.min(clearance(obstacles, state[:2], direction=direction, half=CAR))
+    half = (0.5 * size[0], 0.5 * size[1])
+    return jnp.min(clearance(obstacles, state[:2], direction=direction, half=half))
 
 
 class Scenario(NamedTuple):

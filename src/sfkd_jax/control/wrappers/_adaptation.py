@@ -32,6 +32,8 @@ from sfkd_jax.ranges import (
     AtLeastTwo,
     Fraction,
     Interval,
+    MayBeEmpty,
+    Numbers,
     Positive,
     check_intervals,
 )
@@ -116,9 +118,11 @@ class Adaptation(Stateful):
         friction_drift: standard deviation of the change of friction over a step.
         dwell: mean number of steps between jumps of friction.
         sensor_noise: standard deviation of each measured state of the vehicle; further
-            entries are ignored.
+            entries are ignored. As a setting, () stands for the sensors that the
+            vehicle states.
         model_error: standard deviation of one step of the model, for each entry of ξ;
-            further entries are ignored.
+            further entries are ignored. As a setting, () stands for the errors of the
+            models that ship, which are known for their states alone.
 
     Source: Blom and Bar-Shalom (1988); Pannocchia and Rawlings (2003).
     """
@@ -141,8 +145,8 @@ class Adaptation(Stateful):
     friction_points: AtLeastTwo = 7
     friction_drift: Positive = 0.01
     dwell: Annotated[float, Interval("(1, inf)")] = 30.0
-    sensor_noise: tuple[float, ...] = (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001)
-    model_error: tuple[Positive, ...] = (1e-3, 3e-4, 3e-3, 3e-3, 1.5e-3, 5e-4)
+    sensor_noise: Numbers = ()
+    model_error: Annotated[tuple[Positive, ...], MayBeEmpty()] = ()
 
     def __post_init__(self) -> None:
         low = self.env_low

@@ -1,0 +1,123 @@
+"""The variables of a vehicle: its states, its controls and its environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class StateVariable(NamedTuple):
+    """A state of a vehicle.
+
+    Attributes:
+        name: as in `KNOWN_STATES`, or any other.
+        unit: of the state; "" if nobody has said.
+        deviation: standard deviation of its sensor, in that unit; 0 if the state is
+            observed exactly, as one without a stated deviation is.
+    """
+
+    name: str
+    unit: str = ""
+    deviation: float = 0.0
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "v [m/s]"."""
+        return _labelled(self.name, self.unit)
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether it is an angle [rad]."""
+        return self.unit == "rad"
+
+
+class ControlVariable(NamedTuple):
+    """A control of a vehicle.
+
+    Attributes:
+        name: of the control.
+        unit: of the control.
+        low: lower limit of the actuator; None if it is unknown.
+        high: upper limit of the actuator; None if it is unknown.
+    """
+
+    name: str
+    unit: str
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "steering [rad]"."""
+        return _labelled(self.name, self.unit)
+
+
+class EnvironmentVariable(NamedTuple):
+    """An entry of e.
+
+    Attributes:
+        name: of the entry.
+        unit: of the entry; "-" if it has none.
+    """
+
+    name: str
+    unit: str
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "friction [-]"."""
+        return _labelled(self.name, self.unit)
+
+
+class Size(NamedTuple):
+    """The rectangle that a vehicle covers; its middle is the observed position.
+
+    Attributes:
+        length: [m].
+        width: mirrors included [m].
+    """
+
+    length: float
+    width: float
+
+    @property
+    def half(self) -> tuple[float, float]:
+        """Half of length and width [m], as obstacles state theirs."""
+        return 0.5 * self.length, 0.5 * self.width
+
+
+KNOWN_STATES = {
+    known.name: known
+    for known in (
+        StateVariable("p_x", "m", 0.015),
+        StateVariable("p_y", "m", 0.015),
+        StateVariable("yaw", "rad", 0.002),
+        StateVariable("v", "m/s", 0.03),
+        StateVariable("v_y", "m/s", 0.02),
+        StateVariable("yaw_rate", "rad/s", 0.002),
+        StateVariable("steering", "rad", 0.001),
+    )
+}
+"""States by name, with the sensors of a satellite and inertial unit of survey grade."""
+STEERING = ControlVariable("steering", "rad")
+"""The first control of every vehicle, without its limits."""
+ACCELERATION = ControlVariable("acceleration", "m/s^2")
+"""The second control, without its limits."""
+SPEED_COMMAND = ControlVariable("speed command", "m/s")
+"""The second control in place of the acceleration, with a loop around the speed."""
+FRICTION_AND_WIND = (
+    EnvironmentVariable("friction", "-"),
+    EnvironmentVariable("lateral wind", "m/s"),
+)
+"""e, unless `environment.names` or the columns of logs say otherwise."""
+CAR_SIZE = Size(4.5, 2.0)
+"""Of every vehicle that does not state its own."""
+
+
+def states_of(names: Iterable[str]) -> tuple[StateVariable, ...]:
+    """Return the states of these names; of an unknown one nothing but its name."""
+    return tuple(KNOWN_STATES.get(name, StateVariable(name)) for name in names)
+
+
+def _labelled(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit else name
