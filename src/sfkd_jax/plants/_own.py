@@ -70,8 +70,10 @@ def own(
     controls = (STEERING, SPEED_COMMAND if speed_loop else ACCELERATION)
     if not without_limits:
         controls = tuple(
-            one._replace(low=low, high=high)
-            for one, low, high in zip(controls, control_low, control_high, strict=True)
+            control._replace(low=low, high=high)
+            for control, low, high in zip(
+                controls, control_low, control_high, strict=True
+            )
         )
     # Logs do not tell where the centre of mass is. It is taken to be in the middle.
     bicycle = nominal_derivative(wheelbase, 0.5 * wheelbase, states=len(state_names))

@@ -11,9 +11,9 @@ class StateVariable(NamedTuple):
 
     Attributes:
         name: as in `KNOWN_STATES`, or any other.
-        unit: of the state; "" if nobody has said.
-        deviation: standard deviation of its sensor, in that unit; 0 if the state is
-            observed exactly, as one without a stated deviation is.
+        unit: of the state; "" if it is not known.
+        deviation: standard deviation of its sensor, in that unit. 0 stands for an exact
+            observation, and is the value of a state without a stated deviation.
     """
 
     name: str
@@ -111,11 +111,11 @@ FRICTION_AND_WIND = (
 )
 """e, unless `environment.names` or the columns of logs say otherwise."""
 CAR_SIZE = Size(4.5, 2.0)
-"""Of every vehicle that does not state its own."""
+"""Size of every vehicle that does not state one."""
 
 
 def states_of(names: Iterable[str]) -> tuple[StateVariable, ...]:
-    """Return the states of these names; of an unknown one nothing but its name."""
+    """Return the states of these names; an unknown state has nothing but its name."""
     return tuple(KNOWN_STATES.get(name, StateVariable(name)) for name in names)
 
 

@@ -46,7 +46,7 @@ class Vehicle(NamedTuple):
         dt: sampling period [s].
         wheelbase: [m].
         states: pose first, then the body state.
-        controls: steering first. Without limits only if there is no step.
+        controls: steering first. They may lack limits if there is no step.
         step: (x, u, e) -> x one sampling period later.
         nominal: the same for the textbook kinematic bicycle, which knows neither
             friction nor wind.
@@ -80,22 +80,26 @@ class Vehicle(NamedTuple):
     @property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states."""
-        return tuple(one.name for one in self.states)
+        return tuple(state.name for state in self.states)
 
     @property
     def sensor_noise(self) -> tuple[float, ...]:
-        """Standard deviations of the sensors, one a state; 0 of an exact one."""
-        return tuple(one.deviation for one in self.states)
+        """Standard deviations of the sensors, one per state; 0 for an exact sensor."""
+        return tuple(state.deviation for state in self.states)
 
     @property
     def control_low(self) -> tuple[float, ...]:
         """Lower limits of the actuators; () if they are unknown."""
-        return tuple(one.low for one in self.controls if one.low is not None)
+        return tuple(
+            control.low for control in self.controls if control.low is not None
+        )
 
     @property
     def control_high(self) -> tuple[float, ...]:
         """Upper limits of the actuators; () if they are unknown."""
-        return tuple(one.high for one in self.controls if one.high is not None)
+        return tuple(
+            control.high for control in self.controls if control.high is not None
+        )
 
 
 def side_force(wind: Scalar, *, wind_force: float) -> Scalar:
@@ -275,8 +279,8 @@ def along_path(
 
     controls = path_controls(vehicle)
     perturbations = (
-        one._replace(low=-limit, high=limit)
-        for one, limit in zip(controls[:2], largest, strict=True)
+        control._replace(low=-limit, high=limit)
+        for control, limit in zip(controls[:2], largest, strict=True)
     )
     return vehicle._replace(
         states=path_states(vehicle),
@@ -294,7 +298,8 @@ def path_states(vehicle: Vehicle) -> tuple[StateVariable, ...]:
 
     e_y has the deviation of a position, e_ψ that of the yaw.
     """
-    position, _, yaw = pose = vehicle.states[:3]
+    pose = vehicle.states[:3]
+    position, _, yaw = pose
     errors = (position._replace(name="e_y"), yaw._replace(name="e_psi"))
     return (*pose, *errors, *vehicle.states[3:])
 
@@ -324,7 +329,7 @@ def axes(vehicle: Vehicle, *, along_path: bool) -> dict[str, list[str]]:
     states = path_states(vehicle) if along_path else vehicle.states
     controls = path_controls(vehicle) if along_path else vehicle.controls
     return {
-        "state": [one.label for one in states[3:]],
-        "control": [one.label for one in controls],
-        "env": [one.label for one in vehicle.environment],
+        "state": [state.label for state in states[3:]],
+        "control": [control.label for control in controls],
+        "env": [entry.label for entry in vehicle.environment],
     }
