@@ -53,7 +53,10 @@ def certified(monkeypatch, tmp_path):
         first = settings(f"root={tmp_path}", *recorded)
         first.run_dir.mkdir(parents=True, exist_ok=True)
         (first.run_dir / "policy.safetensors").touch()
-        document = {"valid": True, "certification": stages._recorded_certification(first)}
+        document = {
+            "valid": True,
+            "certification": stages._recorded_certification(first),
+        }
         write_json(first.run_dir / "certificate.json", document)
         made.clear()
         stages.ensure_certificate(settings(f"root={tmp_path}", *overrides))

@@ -137,11 +137,11 @@ class DrivingTask:
         """A key -> a road with its schedule of friction and wind."""
         if not isinstance(self.scenario, str):
             return self.scenario
-        settings: dict[str, Any] = {"name": self.scenario}
+        options: dict[str, Any] = {"name": self.scenario}
         if self.scenario == "obstacles":
-            settings["peak_curvature"] = 0.004
-            settings["wavelengths"] = (100.0, 300.0)
-        return build.build_scenario(settings, self.plant, duration=self.duration)
+            options["peak_curvature"] = 0.004
+            options["wavelengths"] = (100.0, 300.0)
+        return build.build_scenario(options, self.plant, duration=self.duration)
 
     @property
     def action_size(self) -> int:

@@ -192,18 +192,18 @@ def _settings_of(simulator: Any) -> dict[str, Any]:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    settings: dict[str, Any] = {"timeout_s": PATIENCE, "workers": cores}
-    for name in (*OPTIONAL_SETTINGS, *settings):
+    stated: dict[str, Any] = {"timeout_s": PATIENCE, "workers": cores}
+    for name in (*OPTIONAL_SETTINGS, *stated):
         value = getattr(simulator, name, None)
         if value is None:
             continue
         number_type = {"workers": int, "speed_loop": bool}.get(name, float)
         plain = np.asarray(value, number_type).tolist()
-        settings[name] = tuple(plain) if isinstance(plain, list) else plain
+        stated[name] = tuple(plain) if isinstance(plain, list) else plain
     environment_names = getattr(simulator, "environment_names", ())
-    settings["environment_names"] = tuple(map(str, environment_names))
-    settings["state_names"] = tuple(map(str, simulator.state_names))
-    return settings
+    stated["environment_names"] = tuple(map(str, environment_names))
+    stated["state_names"] = tuple(map(str, simulator.state_names))
+    return stated
 
 
 def _serve(channel: Connection) -> None:
