@@ -19,10 +19,12 @@ from sfkd_jax import policy, rollout, store
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
+    _schema,
     _verification,
     verify_document,
 )
-from sfkd_jax.certification._verification import Follows, Measured, Proved, schema
+from sfkd_jax.certification._rules import Follows, Measured, Proved
+from sfkd_jax.certification._verification import schema
 from sfkd_jax.certification._weights import exported
 
 POLICIES = ("kinematic", "dynamic", "kinematic_path", "dynamic_path")
@@ -78,7 +80,7 @@ def forgeries(rule, holder, key):
         others += [float(value), value + 0.5] if isinstance(value, int) else []
     elif isinstance(rule, Follows):
         others += [10 * value, 0.1 * value, 0, -value, float("inf")]
-        others += [value * (1 + 3 * rule.share) or 1e-9, float(value)]
+        others += [value * (1 + 3 * rule.tolerance) or 1e-9, float(value)]
     # A multiplier that proves as much is as good.
     else:
         others += [10 * value, 0.1 * value] if inner[0] is holder else [-value]
@@ -99,11 +101,10 @@ def test_what_ships_verifies_and_every_entry_has_a_class(plant):
 @pytest.mark.parametrize("plant", ["kinematic", "dynamic_path"])
 def test_no_forged_entry_is_accepted(plant, monkeypatch):
     """Each entry: changed in kind and size, left out, misspelt, swapped."""
-    for name, known in (
-        ("exported", weights_of(plant)),
-        ("fingerprint", honest(plant)["params_sha256"]),
-    ):
-        monkeypatch.setattr(_verification, name, lambda *_, known=known: known)
+    weights = weights_of(plant)
+    digest = honest(plant)["params_sha256"]
+    monkeypatch.setattr(_verification, "exported", lambda *_: weights)
+    monkeypatch.setattr(_schema, "fingerprint", lambda *_: digest)
     document = {"": store.read_json(policy.SHIPPED / plant / "certificate.json")}
     rules = schema(document[""], shipped(plant), weights_of(plant))
     accepted, tried = [], Counter()
@@ -292,7 +293,12 @@ def test_a_policy_with_a_shield_loads_with_one_or_if_asked_without(tmp_path):
 
 def test_what_ships_loads_in_double_precision():
     code = "import sys, sfkd_jax; print(all(sfkd_jax.load(run).certificate for run in sys.argv[1:]))"
-    command = [sys.executable, "-c", code, *(policy.SHIPPED / name for name in POLICIES)]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        *(policy.SHIPPED / name for name in POLICIES),
+    ]
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.stdout == "True\n", done.stderr[-2000:]

@@ -8,7 +8,9 @@ import pytest
 from networks import NETWORK, TURNED, rotation
 
 from sfkd_jax.certification import CertificationRefused, _metrics, check_metric
-from sfkd_jax.certification._claims import require_lyapunov
+from sfkd_jax.certification._metric_claims import (
+    require_lyapunov,
+)
 from sfkd_jax.certification._metrics import prove_lyapunov, solve_metric
 
 SIZE = 6

@@ -14,12 +14,14 @@ from networks import NETWORK, ROOT, TURNED
 from sfkd_jax import models
 from sfkd_jax.certification import CertificationRefused, OutputMetric
 from sfkd_jax.certification._claims import (
-    OUTPUTS,
     readouts,
+)
+from sfkd_jax.certification._measured import Residuals, residuals
+from sfkd_jax.certification._metric_claims import (
+    OUTPUTS,
     require_output_metric,
     size_of,
 )
-from sfkd_jax.certification._measured import Residuals, residuals
 from sfkd_jax.certification._metrics import accepted_metric, propose_metric
 from sfkd_jax.certification._tubes import radii, worst_gaps
 from sfkd_jax.certification._weights import exported

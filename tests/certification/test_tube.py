@@ -7,7 +7,7 @@ import pytest
 from helpers import certified, driven, jit, model_and_params
 
 from sfkd_jax.certification import latent_tube
-from sfkd_jax.certification._measured import KINDS, residuals
+from sfkd_jax.certification._measured import RESIDUALS, residuals
 from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.rollout import rollout
@@ -50,7 +50,9 @@ def test_free_running_predictions_stay_inside_the_physical_tube():
     """
     model, params = model_and_params("sfkd")
     data, proved = driven(24), certified("sfkd")
-    measured = dict(zip(KINDS, residuals(model, params, data).largest().T, strict=True))
+    measured = dict(
+        zip(RESIDUALS, residuals(model, params, data).largest().T, strict=True)
+    )
     each = jit(jax.vmap(lambda one: rollout(model, params, one).free))
     predicted = np.asarray(each(data))
     true = np.asarray(data.states)[:, 1:]
@@ -62,7 +64,7 @@ def test_free_running_predictions_stay_inside_the_physical_tube():
         tube = tubes(
             alpha=proved.alpha,
             lipschitz=proved.lipschitz,
-            one_step={kind: float(measured[kind][k]) for kind in KINDS},
+            one_step={kind: float(measured[kind][k]) for kind in RESIDUALS},
             horizon=12,
             largest_increment=float(moves[k].max()),
         )["physical"]

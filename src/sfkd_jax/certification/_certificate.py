@@ -1,4 +1,8 @@
-"""Certificates of contraction for all z, u and e, and the document of a policy."""
+"""Certificates of contraction for all z, u and e, and the document of a policy.
+
+`certify` proves and attacks, `verify` checks without a search, and `issue` adds what is
+measured.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +21,21 @@ from sfkd_jax.certification._claims import (
     Box,
     Claims,
     attack_limits,
-    keeps_metrics,
     require_box,
     require_claims,
     with_room,
 )
+from sfkd_jax.certification._core import Matrix
 from sfkd_jax.certification._measured import (
-    KINDS,
+    RESIDUALS,
     Residuals,
     conformal_bounds,
     coverage,
     holds_for,
     residuals,
+)
+from sfkd_jax.certification._metric_claims import (
+    keeps_metrics,
 )
 from sfkd_jax.certification._metrics import prove_lyapunov
 from sfkd_jax.certification._search import prove
@@ -48,11 +55,12 @@ from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.types import Model, Params, Trajectory
 
 MARGIN = 1e-4
-"""By which α must be below 1."""
+"""Distance from 1 below which α must be."""
 PRECISION = (
     "bounds on the float32 weights as real numbers, checked in float64; "
     "float32 rounding of a step counts as d"
 )
+"""How a certificate accounts for the rounding of its numbers, as it states it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,12 +69,14 @@ class Certificate(Claims):
 
     Attributes:
         transport_lipschitz: Lipschitz constant of T(e → e').
-        env_box: [low, high].
+        env_box: [low, high], the corners of E.
         params_sha256: hash of the weights.
-        precision: how float arithmetic is accounted for.
-        attack: largest contraction factor reached by an attack on the float32 model.
-        tightness: α / attack.
-        attacks: all lower bounds by name.
+        precision: how the rounding of numbers is accounted for.
+        attack: largest slope of a step that an attack on the float32 model reached;
+            None without an attack.
+        tightness: α / attack; None without an attack.
+        attacks: slopes that all attacks reached, by name. They are lower bounds of the
+            proved constants.
         versions: of the libraries that computed it.
         seconds: duration of the proof and the attacks.
     """
@@ -87,7 +97,11 @@ class Certificate(Claims):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Certificate:
-        """Read a certificate from JSON values; other keys are ignored."""
+        """Read a certificate from JSON values; other keys are ignored.
+
+        Raises:
+            CertificationRefused: a key is missing.
+        """
         names = [field.name for field in dataclasses.fields(cls)]
         missing = [name for name in names if name not in document]
         require(not missing, f"not a certificate: {', '.join(missing[:3])} missing")
@@ -100,11 +114,11 @@ def certify(
     """Prove a contraction factor for all z, u and e, and attack all proved bounds.
 
     Args:
-        model: a model with `explicit`.
+        model: with explicit weights, `model.structure.explicit`.
         params: its weights as exported.
         env_box: lower and upper corner of E.
-        attack_starts: starting points of the ascent on the float32 model; with 0 there
-            is no ascent and tightness is None.
+        attack_starts: number of starting points of each ascent on the float32 model.
+            With 0 there is no ascent, and tightness is None.
 
     Raises:
         CertificationRefused: the model cannot be certified; gives the reason.
@@ -119,14 +133,15 @@ def certify(
         f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}) "
         f"is not below 1 by the margin {MARGIN:g}",
     )
-    # After the proof: an attack that exceeds it is a fault of the code, see there.
+    # The attacks come after the proof. One that exceeds it shows a fault of the code.
     attacks = attack_claims(model, params, weights, claims, box, attack_starts)
     attack = attacks.get("step")
     return Certificate(
         **vars(claims),
         transport_lipschitz=1.0,
         env_box=box,
-        # Of the parameters as they are stored: what a reader of the policy recomputes.
+        # Of the parameters as they are stored, so that a reader of the policy can
+        # compute the hash again.
         params_sha256=fingerprint(params),
         precision=PRECISION,
         attack=attack,
@@ -150,13 +165,13 @@ def verify(
         certificate: from an untrusted source.
         params: the weights.
         model: that they belong to.
-        weights: explicit weights of `params`, if already computed.
+        weights: explicit weights of `params`; None to compute them here.
 
     Raises:
         CertificateStale: it is about other weights.
         CertificationRefused: a claim does not follow from its witness.
     """
-    # First the hash: a proof about other weights need not be read at all.
+    # The hash comes first: a proof about other weights need not be read at all.
     if fingerprint(params) != certificate.params_sha256:
         raise CertificateStale("the certificate is about other weights")
     weights = exported(model, params) if weights is None else weights
@@ -169,11 +184,10 @@ def verify(
             f"alpha = {alpha} is not below 1, or the transport is not nonexpansive",
         )
         # A text that promises more than these checks cover must not pass.
-        covered = certificate.precision == PRECISION
-        require(covered, "precision is not what is covered")
+        require(certificate.precision == PRECISION, "precision is not what is covered")
         for name, value in certificate.attacks.items():
             limit = limits.get(name)
-            # An attack above the proved bound would contradict the document itself.
+            # With an attack above the proved bound the document contradicts itself.
             require(
                 limit is not None and 0 <= value <= limit * (1 + FLOAT32),
                 f"the attack {name} = {value!r} contradicts the bound {limit}",
@@ -206,38 +220,30 @@ def issue(
         params: its weights as exported.
         validation: trajectories that fix the units of the scores.
         calibration: trajectories that set d̄.
-        held_out: trajectories by name, on which coverage is counted; "test" is
+        held_out: trajectories by name, on which coverage is counted. "test" is
             exchangeable with `calibration`.
         boxes: domain of s, u and e of the measurements; nothing is claimed outside.
         runs: number of independent runs that the trajectories of "calibration" and
-            "test" were cut from; by default every trajectory is one. Guarantees are
+            "test" were cut from. By default every trajectory is a run. Guarantees are
             about new runs only if there are enough of them.
         horizon: of the tubes [steps].
         level: 1 − δ of the conformal bounds.
-        attack_starts: starting points of the attack on the float32 model.
+        attack_starts: number of starting points of each ascent on the float32 model.
 
     Raises:
         CertificationRefused: the model cannot be certified; gives the reason.
     """
     began = time.perf_counter()
-    # First the proof: where it refuses, nothing need be measured.
+    # The proof comes first: where it is refused, nothing need be measured.
     certificate = certify(model, params, boxes["env"], attack_starts=attack_starts)
     weights = with_room(exported(model, params))
-    start = None
-    try:
-        claim = prove_lyapunov(weights)
-        lyapunov = claim.document()
-        start = claim.metric
-    # Nothing else depends on it, so that a missing solver does not stop the rest.
-    except CertificationRefused as reason:
-        lyapunov = {"reason": str(reason)}
-    # Folded for measurements alone: the proof is about the stored weights.
+    lyapunov, start = _lyapunov(weights)
+    # Folded for the measurements alone. The proof is about the stored weights.
     measure = partial(residuals, model, fold(model, params, on_host))
     reference = measure(validation)
     scores = measure(calibration)
     unseen = {name: measure(part) for name, part in held_out.items()}
     outputs = {}
-    largest = None
     try:
         d_bar = _one_step_bounds(reference, scores, unseen, level, runs or {})
         if model.along_path and keeps_metrics(weights):
@@ -246,29 +252,49 @@ def issue(
             )
     except ValueError as reason:
         raise CertificationRefused(str(reason)) from None
-    if not model.along_path:
-        # The longest step seen: an error of yaw moves the car by at most that times
-        # the angle.
-        moves = np.diff(np.asarray(calibration.states, np.float64)[..., :2], axis=-2)
-        largest = float(np.max(np.linalg.norm(moves, axis=-1)))
-    tube = tubes(
-        alpha=certificate.alpha,
-        lipschitz=certificate.lipschitz,
-        one_step=d_bar["one_step"],
-        horizon=horizon,
-        largest_increment=largest,
+    document = certificate.document()
+    document.update(
+        valid=True,
+        lyapunov=lyapunov,
+        decoder_lipschitz=certificate.lipschitz.get("decoder"),
+        d_bar=d_bar,
+        tube=tubes(
+            alpha=certificate.alpha,
+            lipschitz=certificate.lipschitz,
+            one_step=d_bar["one_step"],
+            horizon=horizon,
+            largest_increment=(
+                None if model.along_path else _longest_step(calibration)
+            ),
+        ),
+        outputs=outputs,
+        boxes=dict(boxes),
+        seconds_proof=certificate.seconds,
+        seconds=time.perf_counter() - began,
     )
-    return certificate.document() | {
-        "valid": True,
-        "lyapunov": lyapunov,
-        "decoder_lipschitz": certificate.lipschitz.get("decoder"),
-        "d_bar": d_bar,
-        "tube": tube,
-        "outputs": outputs,
-        "boxes": dict(boxes),
-        "seconds_proof": certificate.seconds,
-        "seconds": time.perf_counter() - began,
-    }
+    return document
+
+
+def _lyapunov(weights: Exported) -> tuple[dict[str, Any], Matrix | None]:
+    """Return the entry about a Lyapunov function of all operators, and its matrix.
+
+    If there is none, the entry gives the reason and the matrix is None. Nothing else
+    depends on it, so that a missing solver does not stop the rest.
+    """
+    try:
+        claim = prove_lyapunov(weights)
+    except CertificationRefused as reason:
+        return {"reason": str(reason)}, None
+    return claim.document(), claim.metric
+
+
+def _longest_step(runs: Trajectory) -> float:
+    """Return the longest way of a step in the runs [m].
+
+    An error of yaw moves the car by at most this length times the angle.
+    """
+    moves = np.diff(np.asarray(runs.states, np.float64)[..., :2], axis=-2)
+    return float(np.max(np.linalg.norm(moves, axis=-1)))
 
 
 def _one_step_bounds(
@@ -278,25 +304,33 @@ def _one_step_bounds(
     level: float,
     runs: Mapping[str, int],
 ) -> dict[str, Any]:
-    """Bounds at `level` for whole trajectories, and their coverage."""
+    """Return the entry about the errors of single steps.
+
+    Args:
+        reference: of the validation part, which fixes the units.
+        measured: of the calibration part.
+        unseen: of parts on which the coverage is counted, by name.
+        level: with which the bounds hold for a whole trajectory.
+        runs: number of independent runs of "calibration" and "test".
+    """
+    # If the scores of the calibration fixed their own units, they would not be
+    # exchangeable with a new score.
     units = reference.largest()
     scores = measured.largest()
-    # Units from validation, or the scores of calibration would not be exchangeable.
     bounds = conformal_bounds(units, scores, level=level)
-    # Only of the test part it is known how many runs it was cut from.
-    counts = {"test": runs.get("test")}
-    shares = {
-        name: coverage(bounds, part.largest(), counts.get(name))
-        for name, part in unseen.items()
-    }
-    one_step = dict(zip(KINDS, bounds.tolist(), strict=True))
+    shares = {}
+    for name, part in unseen.items():
+        # Only of the test part it is known how many runs it was cut from.
+        count = runs.get("test") if name == "test" else None
+        shares[name] = coverage(bounds, part.largest(), count)
+    one_step = dict(zip(RESIDUALS, bounds.tolist(), strict=True))
     independent = runs.get("calibration", len(scores))
     return {
         "value": one_step["latent"],
         "level": level,
         "trajectories": len(scores),
         "runs": independent,
-        # Too few runs: the bound is then about these runs, and the text says so.
+        # With too few runs the bound is about these runs alone, and this text says so.
         "holds_for": holds_for(independent, level),
         **shares.pop("test"),
         "by_scenario": shares,

@@ -16,104 +16,129 @@ from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 
-KINDS = ("latent", "position", "yaw", "body")
+RESIDUALS = ("latent", "position", "yaw", "body")
+"""Names of the errors of a step that are bounded."""
 ROUNDING = 1e-9
 """Far above the rounding error of a share times a count."""
-CHUNK = 50
-"""Runs in a batch."""
+BATCH = 50
+"""Number of runs in a batch."""
 TAIL = 0.1
-"""Part of the runs whose largest values are fitted."""
+"""Share of the runs, those with the largest values, that the tail is fitted to."""
 
 
 class Residuals(NamedTuple):
-    """One-step prediction errors of every step of a run, (run, time, …)."""
+    """Prediction errors of every single step of runs.
 
-    gaps: Float[np.ndarray, "run time rank"]  # d_k in latent coordinates
-    # 2-norms of the errors of position [m], yaw [rad] and body state; along a path of
-    # e_y [m], e_ψ [rad] and the vehicle's own body state.
+    Attributes:
+        gaps: d_k in latent coordinates.
+        outputs: 2-norms of the errors of position [m], yaw [rad] and body state. Along
+            a path these are e_y [m], e_ψ [rad] and the body state of the vehicle.
+    """
+
+    gaps: Float[np.ndarray, "run time rank"]
     outputs: Float[np.ndarray, "run time 3"]
 
     def largest(self) -> Float[np.ndarray, "run 4"]:
-        """Return the largest errors of each run, by `KINDS`.
+        """Return the largest errors of each run, in the order of `RESIDUALS`.
 
-        A bound is about whole runs, not about steps.
+        The bounds are about whole runs, and not about single steps.
         """
         sizes = np.linalg.norm(self.gaps, axis=-1)
         return np.column_stack([np.max(sizes, axis=1), np.max(self.outputs, axis=1)])
 
 
 def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
-    """Measure the error of every step from its true state.
+    """Measure the prediction error of every step from its true state.
 
-    Transport defects and switches of e count.
+    Defects of the transport and switches of e are part of the errors.
     """
     count = runs.controls.shape[0]
-    # The last batch is filled up, so that one program serves all batches
-    filled = jnp.arange(-(-count // CHUNK) * CHUNK).reshape(-1, CHUNK) % count
-    batches = [
-        _errors(model, params, jax.tree.map(lambda leaf, rows=rows: leaf[rows], runs))
-        for rows in filled
-    ]
-    gaps, outputs = (
-        np.concatenate([np.asarray(part, np.float64) for part in parts])[:count]
-        for parts in zip(*batches, strict=True)
+    # The last batch is filled up with first runs, so that one program serves all
+    # batches.
+    rows_of_batches = jnp.arange(-(-count // BATCH) * BATCH).reshape(-1, BATCH) % count
+    gaps = []
+    outputs = []
+    for rows in rows_of_batches:
+        batch = Trajectory(runs.states[rows], runs.controls[rows], runs.envs[rows])
+        gaps_of_batch, outputs_of_batch = _errors(model, params, batch)
+        gaps.append(np.asarray(gaps_of_batch, np.float64))
+        outputs.append(np.asarray(outputs_of_batch, np.float64))
+    return Residuals(
+        gaps=np.concatenate(gaps)[:count], outputs=np.concatenate(outputs)[:count]
     )
-    return Residuals(gaps, outputs)
 
 
 @partial(jax.jit, static_argnums=0)
 def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Array]:
-    """`residuals` of one batch of fixed size."""
+    """Return the fields of `Residuals` for one batch of fixed size."""
 
-    def one(run: Trajectory) -> tuple[Array, Array]:
-        known = rollout(model, params, run)
+    def errors_of_run(run: Trajectory) -> tuple[Array, Array]:
+        predictions = rollout(model, params, run)
         before = run.states[:-1]
         after = run.states[1:]
-        miss = (known.single - after)[:, BODY]
+        body = (predictions.single - after)[:, BODY]
         if model.along_path:
-            # Path states have their outputs in the body, without a pose.
-            kinds = miss[:, LATERAL, None], miss[:, HEADING, None], miss[:, PATH_SPEED:]
+            # The outputs of path states are in the body. They have no pose.
+            outputs = (
+                body[:, LATERAL, None],
+                body[:, HEADING, None],
+                body[:, PATH_SPEED:],
+            )
         else:
-            # As motions of one step: each turns far less than π, so no wrap spoils it.
-            moved = jax.vmap(between)
-            motion = moved(before[:, POSE], known.single[:, POSE])
-            motion -= moved(before[:, POSE], after[:, POSE])
-            kinds = motion[:, :2], motion[:, 2:], miss
-        sizes = jnp.stack([jnp.linalg.norm(kind, axis=1) for kind in kinds], 1)
-        return known.defects, sizes
+            # Poses are compared as motions of one step. Each turns far less than π, so
+            # that the difference of the yaw needs no wrap.
+            motion_of = jax.vmap(between)
+            motion = motion_of(before[:, POSE], predictions.single[:, POSE])
+            motion -= motion_of(before[:, POSE], after[:, POSE])
+            outputs = (motion[:, :2], motion[:, 2:], body)
+        norms = [jnp.linalg.norm(output, axis=1) for output in outputs]
+        return predictions.defects, jnp.stack(norms, 1)
 
-    return jax.vmap(one)(runs)
+    return jax.vmap(errors_of_run)(runs)
 
 
 def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
     """Return the ⌈(n+1) level⌉-th smallest of n scores.
 
-    A new, exchangeable score exceeds it with probability at most 1 − level. Infinite
-    scores are those of runs that no bound holds for.
+    A new, exchangeable score exceeds it with probability at most 1 − level. An infinite
+    score is that of a run for which no bound would hold.
+
+    Raises:
+        ValueError: a score is NaN, there are too few scores for the level, or too many
+            are infinite.
     """
     if np.any(np.isnan(scores)):
         raise ValueError("residuals are not finite")
     check_count(len(scores), level, "calibration trajectories")
-    # (n + 1): the new trajectory counts as one of the exchangeable ones.
-    found = float(np.sort(scores)[math.ceil((len(scores) + 1) * level) - 1])
-    # Too many runs without a bound: there is none at this level.
-    if found == math.inf:
+    # n + 1, because the new trajectory is one of the exchangeable ones.
+    index = math.ceil((len(scores) + 1) * level) - 1
+    quantile = float(np.sort(scores)[index])
+    if quantile == math.inf:
         raise ValueError(
             f"residuals of {np.sum(np.isinf(scores))} of {len(scores)} runs are not "
             f"finite: more than level {level} allows"
         )
-    return found
+    return quantile
 
 
 def supports(count: int, level: float) -> bool:
-    """Whether `count` scores suffice for a conformal quantile: ⌈(n+1) level⌉ ≤ n."""
+    """Return whether n scores suffice for a conformal quantile: ⌈(n+1) level⌉ ≤ n."""
     return math.ceil((count + 1) * level) <= count
 
 
 def check_count(count: int, level: float, what: str) -> None:
-    """Refuse a level that `count` scores, of so many `what`, do not support."""
+    """Refuse a level that too few scores cannot support.
+
+    Args:
+        count: number of scores.
+        level: 1 − δ.
+        what: the scores are of, for the message.
+
+    Raises:
+        ValueError: there are too few.
+    """
     if not supports(count, level):
-        # Rounded down, so that the proposed level is accepted.
+        # Rounded down, so that the level that is proposed will be accepted.
         highest = math.floor(100 * count / (count + 1)) / 100
         raise ValueError(
             f"{count} {what} are too few for certification.level={level:g}: "
@@ -122,37 +147,51 @@ def check_count(count: int, level: float, what: str) -> None:
 
 
 def holds_for(runs: int, level: float) -> str:
-    """Return what a bound from trajectories of so many independent runs is about."""
+    """Return what a bound is about that trajectories of so many runs have given."""
     if supports(runs, level):
         return "new runs like these"
     return f"further segments of the same {runs} runs"
 
 
 def conformal_bounds(
-    reference: Float[np.ndarray, "other kind"],
-    calibration: Float[np.ndarray, "trajectory kind"],
+    reference: Float[np.ndarray, "other error"],
+    calibration: Float[np.ndarray, "trajectory error"],
     *,
     level: float,
-) -> Float[np.ndarray, " kind"]:
-    """Return joint bounds on all kinds over a whole new trajectory (split-conformal).
+) -> Float[np.ndarray, " error"]:
+    """Return bounds on all errors of a whole new trajectory (split-conformal).
 
-    They hold with probability at least `level`. The score of a trajectory is its
-    largest kind in units; the bound is the ⌈(n+1) level⌉-th smallest score. The unit of
-    the first kind is its quantile at `level`; the other kinds exceed theirs a tenth as
-    often. A tube multiplies the first bound by up to 1/(1 − α) and adds the others
-    once, so these units make it tighter than equal quantiles do. `reference` are
-    scores that fix the units, of a split other than `calibration`.
+    Together they hold with probability at least `level`. The score of a trajectory is
+    the largest of its errors, each in its unit. The bounds are the units times the
+    ⌈(n+1) level⌉-th smallest score.
+
+    The unit of the first error is its quantile at `level`. The other errors exceed
+    their units a tenth as often. A tube multiplies the first bound by up to 1/(1 − α)
+    and adds the others once, so that these units make it tighter than equal quantiles
+    do.
+
+    Args:
+        reference: errors that fix the units, of a split other than `calibration`.
+        calibration: errors that give the scores.
+        level: 1 − δ.
+
+    Raises:
+        ValueError: the level is not in (0, 1), the calibration is too small for it, or
+            an error is not finite.
     """
     if not 0 < level < 1:
         raise ValueError(f"a level must lie between 0 and 1, got {level}")
     if not np.all(np.isfinite(reference)):
         raise ValueError("residuals are not finite")
-    shares = [level, *[1.0 - 0.1 * (1.0 - level)] * (reference.shape[1] - 1)]
-    kinds = zip(reference.T, shares, strict=True)
-    units = np.asarray([np.quantile(kind, share) for kind, share in kinds])
-    units[units <= 0] = 1.0  # a kind that is always 0 needs no unit
-    # The largest kind of each trajectory in common units: one score, a joint bound.
-    return units * conformal_quantile(np.max(calibration / units, axis=1), level)
+    others = reference.shape[1] - 1
+    levels = [level, *[1.0 - 0.1 * (1.0 - level)] * others]
+    units = np.asarray(
+        [np.quantile(errors, q) for errors, q in zip(reference.T, levels, strict=True)]
+    )
+    # An error that is always 0 needs no unit.
+    units[units <= 0] = 1.0
+    scores = np.max(calibration / units, axis=1)
+    return units * conformal_quantile(scores, level)
 
 
 def alarm_thresholds(
@@ -163,32 +202,43 @@ def alarm_thresholds(
 ) -> Float[np.ndarray, " chart"]:
     """Return thresholds that a share `rate` of new runs exceeds in any chart.
 
-    The unit of a chart is its 0.99-quantile over `reference`. The largest value of a
-    run in units has a tail that is taken as exponential, fitted to the largest `TAIL`:
-    a rate below one in a run cannot be counted on any affordable number of runs.
+    So small a rate cannot be counted on any affordable number of runs. The tail of the
+    largest value of a run is therefore taken as exponential, and fitted to the share
+    `TAIL` of the runs with the largest values.
+
+    Args:
+        reference: largest values of runs that fix the unit of every chart, which is its
+            0.99-quantile.
+        maxima: largest values of the runs that the tail is fitted to.
+        rate: share of new runs.
     """
     units = np.quantile(reference, 0.99, axis=0)
     units[units <= 0] = 1.0
     largest = np.max(maxima / units, axis=1)
     start = np.quantile(largest, 1.0 - TAIL)
-    excess = float(np.mean(largest[largest > start] - start))
-    return units * (start + excess * max(math.log(TAIL / rate), 0.0))
+    mean_excess = float(np.mean(largest[largest > start] - start))
+    return units * (start + mean_excess * max(math.log(TAIL / rate), 0.0))
 
 
 def coverage(
-    bounds: Float[np.ndarray, " kind"],
-    held_out: Float[np.ndarray, "trajectory kind"],
+    bounds: Float[np.ndarray, " error"],
+    held_out: Float[np.ndarray, "trajectory error"],
     runs: int | None = None,
 ) -> dict[str, Any]:
     """Return the share of held-out trajectories within all bounds, and its interval.
 
-    They were cut from `runs` independent runs; by default every trajectory is one.
+    Args:
+        bounds: on the errors.
+        held_out: errors of the trajectories.
+        runs: number of independent runs that the trajectories were cut from; None if
+            every trajectory is a run.
     """
     share = float(np.mean(np.all(held_out <= bounds, axis=1)))
-    runs = runs or len(held_out)
+    if not runs:
+        runs = len(held_out)
     return {
         "coverage": share,
-        # Segments of one run are dependent: the interval is of independent runs.
+        # Segments of the same run are dependent, so that the interval counts runs.
         "coverage_ci95": coverage_interval(share, runs),
         "coverage_trajectories": len(held_out),
         "coverage_runs": runs,
@@ -198,12 +248,11 @@ def coverage(
 def coverage_interval(share: float, runs: int) -> list[float]:
     """Return the exact 95 % interval of a coverage (Clopper and Pearson, 1934).
 
-    If the share lies between two counts of runs, the interval covers those of both.
+    If the share lies between two counts of runs, the interval contains those of both.
     """
-    # Both sides rounded outwards: the interval is wider than either count's.
-    few = math.floor(share * runs + ROUNDING)
-    many = math.ceil(share * runs - ROUNDING)
-    # At 0 and 1 the ends are exact, where betaincinv is undefined.
-    low = betaincinv(few, runs - few + 1, 0.025) if few else 0.0
-    high = betaincinv(many + 1, runs - many, 0.975) if many < runs else 1.0
+    fewer = math.floor(share * runs + ROUNDING)
+    more = math.ceil(share * runs - ROUNDING)
+    # At the counts 0 and `runs` the ends are exact, and betaincinv is undefined.
+    low = betaincinv(fewer, runs - fewer + 1, 0.025) if fewer else 0.0
+    high = betaincinv(more + 1, runs - more, 0.975) if more < runs else 1.0
     return [float(low), float(high)]

@@ -1,15 +1,20 @@
-"""Error tubes from a contraction factor and disturbance bounds (corrected thm:ISS)."""
+"""Error tubes from a contraction factor and bounds on disturbances.
+
+They follow from the corrected theorem on input-to-state stability of the paper
+(thm:ISS).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.certification._claims import OUTPUTS, OutputMetric, readouts
+from sfkd_jax.certification._claims import (
+    readouts,
+)
 from sfkd_jax.certification._measured import (
     Residuals,
     conformal_bounds,
@@ -17,25 +22,40 @@ from sfkd_jax.certification._measured import (
     coverage,
     coverage_interval,
 )
+from sfkd_jax.certification._metric_claims import (
+    OUTPUTS,
+    OutputMetric,
+)
 from sfkd_jax.certification._metrics import propose_metric
 from sfkd_jax.certification._weights import CertificationRefused, Exported
 
 WORST = 5
-"""Steps of every validation run that a metric is optimised for."""
-OUTPUT_KINDS = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
-"""Radii in a document, and the errors that they bound."""
+"""Number of steps of every validation run that a metric is optimised for."""
+RADII = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
+"""Names of radii in a document, and of the outputs whose errors they bound."""
 
 
 def latent_tube(
     alpha: float, d_bar: float, horizon: int
 ) -> Float[np.ndarray, " horizon"]:
-    """Return R_1 … R_T with |z_k − ẑ_k| ≤ R_k as long as all |d_j| ≤ d̄, for ẑ_0 = z_0.
+    """Return the radii R_1 … R_T of a tube in latent coordinates.
 
-    R_k = d̄ (1 − α^k)/(1 − α) = α R_{k−1} + d̄, T the horizon [steps].
+    If ẑ_0 = z_0 and all |d_j| ≤ d̄, then |z_k − ẑ_k| ≤ R_k with
+
+        R_k = α R_{k−1} + d̄ = d̄ (1 − α^k)/(1 − α),   R_0 = 0
+
+    Args:
+        alpha: contraction factor α.
+        d_bar: bound of the disturbance of a step, d̄.
+        horizon: T [steps].
     """
-    # The recursion instead of the closed form, which divides by 1 − α.
-    steps = accumulate([d_bar] * horizon, lambda radius, d: alpha * radius + d)
-    return np.asarray([*steps])
+    # The recursion is used, because the closed form divides by 1 − α.
+    radius = d_bar
+    radii = []
+    for _ in range(horizon):
+        radii.append(radius)
+        radius = alpha * radius + d_bar
+    return np.asarray(radii)
 
 
 def tubes(
@@ -46,9 +66,10 @@ def tubes(
     horizon: int,
     largest_increment: float | None,
 ) -> dict[str, Any]:
-    """Return the tubes of a document, for an exact z_0: R_1 … R_T, outputs, limits.
+    """Return the tubes of a document, for predictions that start at the true z_0.
 
-    Along a path all outputs are decoded from z, so that no error accumulates:
+    They are the radii R_1 … R_T of `latent_tube`, those of the outputs, and their
+    limits. Along a path all outputs are decoded from z, so that no error accumulates:
 
         |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
 
@@ -59,44 +80,46 @@ def tubes(
         |e_p,k|   ≤ Σ_j (L_p R_j + ε_p + |dp| |e_yaw,j|)
 
     Args:
-        alpha: contraction factor.
+        alpha: contraction factor α.
         lipschitz: L of the outputs, by "position", "yaw", "body".
-        one_step: measured d̄ ("latent") and ε by the same names, at the true latent.
+        one_step: measured bounds at the true latent: d̄ ("latent"), and ε by the names
+            of the outputs.
         horizon: T [steps].
         largest_increment: |dp|, the longest step [m]; None along a path.
     """
     latent = latent_tube(alpha, one_step["latent"], horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
     ultimate = one_step["latent"] / (1 - alpha)
-    limit = None
-    # R_0 = 0: a prediction starts at the observed state.
+    # R_0 … R_{T−1}, and the limit. R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1], [ultimate]])
     radii = {
-        name: lipschitz[kind] * alpha * before + one_step[kind]
-        for name, kind in OUTPUT_KINDS.items()
+        name: lipschitz[output] * alpha * before + one_step[output]
+        for name, output in RADII.items()
     }
-    # With increments the pose drifts; without them there is a limit of every radius.
+    limits = None
     if largest_increment is None:
-        limit = {name: float(radius[-1]) for name, radius in radii.items()}
+        limits = {name: float(radius[-1]) for name, radius in radii.items()}
     else:
+        # Errors of increments add up, so that the pose has no limit.
         yaw = np.cumsum(lipschitz["yaw"] * before + one_step["yaw"])
         # An error of yaw moves only the increments that come after it.
-        turned = np.concatenate([[0.0], yaw[:-1]])
+        yaw_before = np.concatenate([[0.0], yaw[:-1]])
         increments = lipschitz["position"] * before + one_step["position"]
-        position = np.cumsum(increments + largest_increment * turned)
-        radii |= {"position_m": position, "yaw_rad": yaw}
+        radii["position_m"] = np.cumsum(increments + largest_increment * yaw_before)
+        radii["yaw_rad"] = yaw
     return {
         "latent": latent.tolist(),
         "physical": {name: radius[:-1].tolist() for name, radius in radii.items()},
         "ultimate": ultimate,
-        "asymptotic": limit,
+        "asymptotic": limits,
         "largest_increment_m": largest_increment,
     }
 
 
 FORMS = ("asymptotic", "vehicle_to_nominal")
-"""Bounds on |y_k − ŷ_k| of vehicle and nominal model over a whole run: from the largest
-disturbance alone, and from the sequence of all disturbances.
+"""Two bounds on |y_k − ŷ_k| of vehicle and nominal model over a whole run. The first
+follows from the largest disturbance alone, the second from the sequence of all
+disturbances.
 """
 
 
@@ -113,23 +136,32 @@ def radii(
         |y_k − ŷ_k| ≤ |C (F(z_{k−1}) − F(ẑ_{k−1}))| + ε_k ≤ L α R_{k−1} + ε_k
                     ≤ L α max|d|_P / (1 − α) + max ε.
 
-    `start` is z_0 − ẑ_0; None if the nominal model starts at the state of the car.
+    Args:
+        measured: errors of every step of the runs.
+        name: of the output.
+        claim: proved constants of the output.
+        start: z_0 − ẑ_0; None if the nominal model starts at the state of the car.
     """
     # |d|_P is the 2-norm of d'L with P = L L'.
     factor = np.linalg.cholesky(claim.metric)
-    sizes = np.linalg.norm(measured.gaps @ factor, axis=-1)
-    misses = measured.outputs[..., OUTPUTS.index(name)]
-    farthest = radius = initial = np.zeros(len(sizes))
-    if start is not None:
-        radius = initial = np.linalg.norm(start @ factor, axis=1)
-    # The output error is read before the radius takes in this step's disturbance.
-    for step in range(sizes.shape[1]):
-        distance = claim.lipschitz * claim.alpha * radius + misses[:, step]
+    disturbances = np.linalg.norm(measured.gaps @ factor, axis=-1)
+    errors = measured.outputs[..., OUTPUTS.index(name)]
+    if start is None:
+        initial = np.zeros(len(disturbances))
+    else:
+        initial = np.linalg.norm(start @ factor, axis=1)
+    radius = initial
+    farthest = np.zeros(len(disturbances))
+    for step in range(disturbances.shape[1]):
+        # The output is bounded by the radius before the disturbance of this step.
+        distance = claim.lipschitz * claim.alpha * radius + errors[:, step]
         farthest = np.maximum(farthest, distance)
-        radius = claim.alpha * radius + sizes[:, step]
-    # A start outside the limit shrinks towards it: the larger of both bounds all k.
-    ultimate = np.maximum(initial, np.max(sizes, axis=1) / (1.0 - claim.alpha))
-    asymptotic = claim.lipschitz * claim.alpha * ultimate + np.max(misses, axis=1)
+        radius = claim.alpha * radius + disturbances[:, step]
+    # A start outside of the limit shrinks towards it, so that the larger of both bounds
+    # R_k for all k.
+    limit = np.max(disturbances, axis=1) / (1.0 - claim.alpha)
+    ultimate = np.maximum(initial, limit)
+    asymptotic = claim.lipschitz * claim.alpha * ultimate + np.max(errors, axis=1)
     return dict(zip(FORMS, (asymptotic, farthest), strict=True))
 
 
@@ -144,9 +176,18 @@ def output_tubes(
 ) -> dict[str, dict[str, Any]]:
     """Prove a metric for each of `OUTPUTS` and calibrate a bound on |y − ŷ| with it.
 
-    The metric is optimised for the validation runs, from `start`, a common Lyapunov
-    matrix of the operators. Each bound holds at `level` for a whole new run. Empty if
-    there is no metric for one of the outputs.
+    Args:
+        weights: of the model.
+        validation: errors of runs that the metrics are optimised for.
+        calibration: errors of runs that set the bounds.
+        test: errors of runs on which coverage is counted.
+        level: with which each bound holds for a whole new run.
+        start: common Lyapunov matrix of the operators, where the search begins; None to
+            begin at I.
+
+    Returns:
+        The entries of the outputs by name. There is none if there is no metric for one
+        of them, because a corridor needs both position and heading.
     """
     documents = {}
     for name in OUTPUTS:
@@ -154,33 +195,41 @@ def output_tubes(
         gaps = worst_gaps(validation)
         try:
             claim = propose_metric(weights, rows, gaps, start)
-        # Both outputs or none: a corridor needs position and heading.
         except CertificationRefused:
             return {}
-        scores, unseen = (radii(part, name, claim) for part in (calibration, test))
-        part: dict[str, Any] = {"tube": {}, "coverage": {}, "coverage_ci95": {}}
-        documents[name] = claim.document() | {"coverage_runs": len(test.gaps)} | part
-        for form in FORMS:
-            bound = part["tube"][form] = conformal_quantile(scores[form], level)
-            share = part["coverage"][form] = float(np.mean(unseen[form] <= bound))
-            part["coverage_ci95"][form] = coverage_interval(share, len(test.gaps))
+        scores = radii(calibration, name, claim)
+        unseen = radii(test, name, claim)
+        count = len(test.gaps)
+        bounds = {form: conformal_quantile(scores[form], level) for form in FORMS}
+        shares = {form: float(np.mean(unseen[form] <= bounds[form])) for form in FORMS}
+        documents[name] = {
+            **claim.document(),
+            "coverage_runs": count,
+            "tube": bounds,
+            "coverage": shares,
+            "coverage_ci95": {
+                form: coverage_interval(share, count) for form, share in shares.items()
+            },
+        }
     return documents
 
 
 def worst_gaps(measured: Residuals) -> Float[np.ndarray, "run worst rank"]:
-    """Return d of the `WORST` steps of every run with the largest |d|."""
+    """Return d of the `WORST` steps of every run with the largest |d|.
+
+    These steps decide the radius of a tube, and so few keep the search fast.
+    """
     sizes = np.linalg.norm(measured.gaps, axis=-1)
-    # The worst steps alone decide the radius, and the search takes few of them.
-    order = np.argsort(sizes, axis=1)[:, -WORST:]
-    return np.take_along_axis(measured.gaps, order[..., None], axis=1)
+    worst = np.argsort(sizes, axis=1)[:, -WORST:]
+    return np.take_along_axis(measured.gaps, worst[..., None], axis=1)
 
 
 JOINT = ("vehicle_to_nominal_position", "vehicle_to_nominal_yaw", "nominal")
-"""Measured bounds of a corridor that hold jointly at the level: distances of vehicle
-and nominal model in e_y [m] and e_ψ [rad], and |ê_y| of the nominal model [m].
+"""Measured bounds of a corridor that hold together at the level: the distances between
+vehicle and nominal model in e_y [m] and e_ψ [rad], and |ê_y| of the nominal model [m].
 """
 ALONE = ("asymptotic_position", "asymptotic_yaw")
-"""Bounds from the largest disturbance alone, which hold one by one."""
+"""Bounds from the largest disturbance alone. Each of them holds at the level."""
 
 
 def calibrate_corridor(
@@ -191,13 +240,20 @@ def calibrate_corridor(
 ) -> dict[str, float]:
     """Return split-conformal bounds for a new run, by name.
 
-    The bounds in `JOINT` hold together with probability at least `level`, the others
-    one by one. The lateral tube decides the joint score: heading and nominal corridor
-    exceed their units a tenth as often. `reference` are the runs that fix the units.
+    The bounds in `JOINT` hold together with probability at least `level`, those in
+    `ALONE` one by one. The joint score is mostly that of the lateral tube, since
+    heading and nominal corridor exceed their units a tenth as often.
+
+    Args:
+        reference: scores of the runs that fix the units.
+        scores: of the runs that set the bounds, in the order of `JOINT` and `ALONE`.
+        level: 1 − δ.
     """
-    together = len(JOINT)
-    joint = conformal_bounds(reference[:, :together], scores[:, :together], level=level)
-    alone = [conformal_quantile(column, level) for column in scores[:, together:].T]
+    joint_count = len(JOINT)
+    joint = conformal_bounds(
+        reference[:, :joint_count], scores[:, :joint_count], level=level
+    )
+    alone = [conformal_quantile(column, level) for column in scores[:, joint_count:].T]
     return dict(zip((*JOINT, *ALONE), [*joint.tolist(), *alone], strict=True))
 
 

@@ -16,6 +16,7 @@ from sfkd_jax.types import Model, Params, Samples
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
 TRANSPORTS = ("identity", "rotation")
+"""Kinds of transport that do not enlarge distances of latent states."""
 MALFORMED = (
     LookupError,
     TypeError,
@@ -38,23 +39,38 @@ class CertificateStale(Exception):
 
 
 def require(holds: object, reason: str) -> None:
-    """Refuse a certificate, with the reason, unless something holds.
+    """Refuse a certificate unless a condition holds.
 
-    Callers write a comparison that is false of a NaN.
+    Callers write comparisons that are false for a NaN.
+
+    Args:
+        holds: the condition.
+        reason: for the refusal.
+
+    Raises:
+        CertificationRefused: it does not hold.
     """
     if not holds:
         raise CertificationRefused(reason)
 
 
 def require_all(checks: Mapping[str, object], where: str = "") -> None:
-    """Refuse the first claim that does not hold, by name."""
+    """Refuse the first claim that does not hold.
+
+    Args:
+        checks: whether each claim holds, by its name.
+        where: is written before the name.
+
+    Raises:
+        CertificationRefused: a claim does not hold.
+    """
     for name, holds in checks.items():
         require(holds, f"{where}{name} does not follow from its witness")
 
 
 @contextmanager
 def well_formed() -> Iterator[None]:
-    """Refuse a document whose values are of unexpected types, in one line."""
+    """Turn errors about values of unexpected types into a refusal, in one line."""
     try:
         yield
     except KeyError as reason:
@@ -66,19 +82,23 @@ def well_formed() -> Iterator[None]:
 
 
 def exported(model: Model, params: Params) -> Exported:
-    """Return the explicit weights in float64; refuse those that nothing is known of.
+    """Return the explicit weights of a model in float64.
 
-    They are those of the folded parameters, which a controller multiplies.
+    They are computed from the folded parameters, as in a controller.
+
+    Raises:
+        CertificationRefused: the model has no explicit weights, they are not finite, or
+            too little is known about its operators, activation or transport.
     """
     explicit = model.structure.explicit
     if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
     weights = on_host(explicit, fold(model, params, on_host))
-    # float32 numbers are float64 numbers exactly: nothing is rounded here.
+    # Every float32 number is a float64 number, so that nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
     require(finite, "the weights are not finite")
-    # A(e) between two samples is unknown, however dense they are.
+    # However dense samples are, A(e) in between is unknown.
     if isinstance(weights.operators, Samples):
         raise CertificationRefused(
             f"grid-only evidence: {len(weights.operators.operators)} sampled "
@@ -100,22 +120,26 @@ def exported(model: Model, params: Params) -> Exported:
 def fingerprint(params: Params) -> str:
     """Return the SHA-256 of all weights with their names, types and shapes."""
     digest = hashlib.sha256()
-    # With names and shapes: two trees of the same bytes are not the same weights.
-    for path, leaf in jax.tree_util.tree_flatten_with_path(unfold(params))[0]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(unfold(params))
+    for path, leaf in leaves:
         array = np.asarray(leaf)
-        digest.update(
-            f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode()
-        )
+        name = jax.tree_util.keystr(path)
+        # Two trees of the same bytes are the same weights only if names, types and
+        # shapes are the same, too.
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit BLAS to one thread: on busy cores two are a hundred times slower here."""
+    """Limit BLAS to one thread.
+
+    The matrices are small. On busy cores two threads are a hundred times slower.
+    """
     try:
         from threadpoolctl import threadpool_limits
-    except ImportError:  # to verify a certificate, no speed is needed
+    except ImportError:  # Without it everything still works, and is slower.
         yield
     else:
         with threadpool_limits(1, user_api="blas"):
