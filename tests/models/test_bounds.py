@@ -11,7 +11,7 @@ from helpers import ENV_HIGH, ENV_LOW, certified, explicit, jit, model_and_param
 from sfkd_jax.certification import lipschitz_upper
 from sfkd_jax.certification._attack import attack_slopes
 from sfkd_jax.models._networks import Sandwich, Weights, bounded, gram_bound
-from sfkd_jax.models.sfkd._model import rotate_planes
+from sfkd_jax.models.sfkd._latent_model import rotate_planes
 from sfkd_jax.models.sfkd._residual import share_budget
 from sfkd_jax.rollout import fold
 

@@ -11,7 +11,7 @@ from helpers import at, dataset, jit, space
 from sfkd_jax import data as datasets
 from sfkd_jax import models
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._koopman import along_circle, ridge_regression
+from sfkd_jax.models._edmd import along_circle, ridge_regression
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import POSE, Trajectory
 

@@ -1,17 +1,17 @@
-"""Rollout models: listed by name in `FACTORIES`."""
+"""Models of the vehicle; those that are learned are listed in `FACTORIES`."""
 
-from sfkd_jax.models._continuous import flat as flat
-from sfkd_jax.models._continuous import icode as icode
-from sfkd_jax.models._continuous import icode_mppi as icode_mppi
-from sfkd_jax.models._continuous import nested as nested
 from sfkd_jax.models._continuous import neural_ode as neural_ode
-from sfkd_jax.models._continuous import one_step as one_step
-from sfkd_jax.models._continuous import physics as physics
-from sfkd_jax.models._continuous import state_model as state_model
-from sfkd_jax.models._continuous import step_of as step_of
 from sfkd_jax.models._control_synth import control_synth as control_synth
+from sfkd_jax.models._icode import icode as icode
+from sfkd_jax.models._icode import icode_mppi as icode_mppi
 from sfkd_jax.models._koopman import koopman as koopman
+from sfkd_jax.models._one_step import one_step as one_step
 from sfkd_jax.models._own import own as own
+from sfkd_jax.models._state_model import flat as flat
+from sfkd_jax.models._state_model import nested as nested
+from sfkd_jax.models._state_model import physics as physics
+from sfkd_jax.models._state_model import state_model as state_model
+from sfkd_jax.models._state_model import step_of as step_of
 from sfkd_jax.models.sfkd import sfkd as sfkd
 
 FACTORIES = {
@@ -24,7 +24,8 @@ FACTORIES = {
 }
 """Learned models: name -> factory(space, *, settings).
 
-`space` holds measured scales, which fix all sizes. Settings that several have: `dt`,
-the sampling period and the solver's step [s]; `environment`, whether e is used (if not,
-e is 0); `frame`, "body", or "path" for path coordinates, which have no pose.
+`space` holds measured scales, which fix all sizes. Several models have these settings:
+`dt` is the sampling period and the solver's step [s]. `environment` is whether e is
+used; if not, e is 0. `frame` is "body", or "path" for path coordinates, which have no
+pose.
 """

@@ -1,4 +1,4 @@
-"""ControlSynth neural ODE: contracting by construction, with additive inputs."""
+"""The ControlSynth neural ODE, which contracts by construction."""
 
 from __future__ import annotations
 
@@ -14,20 +14,25 @@ from sfkd_jax.ranges import Positive
 from sfkd_jax.types import Control, Environment, Key, Model, Params, Space
 
 GAIN = 0.3
-"""Initial size of the networks of the state: their decay is GAIN² per second, slow
-against the sampling period.
+"""Initial size of the networks of the state. Their decay is GAIN² per second, which is
+slow against the sampling period.
 """
 ROUNDING = 1e-5
 """Margin on the rate relative to the size of the matrices, so that the inequality
-also holds in float32.
+holds in float32 as well.
 """
 
 
 class Synthesis(NamedTuple):
-    """L s + Σ_j A_j tanh(W_j s + c_j), the M networks stacked: [A_1 … A_M], [W_1; …].
+    """L s + Σ_j A_j tanh(W_j s + c_j), with the M networks stacked.
 
-    P, in which it contracts, and λ of the diagonal Λ that proves it are None where
-    nothing is claimed.
+    Attributes:
+        linear: L.
+        outer: [A_1 … A_M].
+        inner: [W_1; …; W_M].
+        offsets: [c_1; …; c_M].
+        metric: P, in which the flow contracts; None if that is not claimed.
+        multipliers: diagonal of the Λ that proves it; None likewise.
     """
 
     linear: Float[Array, "out body"]
@@ -64,7 +69,7 @@ def control_synth(
     environment: bool = True,
     frame: str = "body",
 ) -> Model:
-    """Networks of the state beside a network of the input, contracting at a hard rate.
+    """Networks of the state plus a network of the input, with a contraction rate.
 
         ds/dt = A_0 s + Σ_j A_j tanh(W_j s + c_j) + g(u, e)
         twist = C_0 s + Σ_j C_j tanh(V_j s + d_j) + h(u, e)
@@ -79,12 +84,12 @@ def control_synth(
         T A_0 T⁻¹ = −γI − ¼ BB' − ½ XX' + (Y − Y'),
         T A = (B − Ŵ') Λ^½,   W T⁻¹ = Λ^(−½) Ŵ
 
-    (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free, T is triangular
+    (Schur's complement of −2Λ leaves −XX'). B, X, Y, Ŵ and Λ are free; T is triangular
     and well conditioned. The claim is about the continuous flow, not about its RK4
-    discretisation. Inputs are only added, as in the original: that is a limit of the
-    published structure, kept here. In the original the input is a second state of an
-    autonomous system, and the published code has neither A_j nor a matrix inequality.
-    The offsets c_j and d_j do not affect the proof.
+    discretisation. Inputs are only added, as in the original. That is a limitation of
+    the published structure, and it is kept here. In the original the input is a second
+    state of an autonomous system, and the published code has neither A_j nor a matrix
+    inequality. The offsets c_j and d_j do not affect the proof.
 
     Args:
         networks: M, number of networks of the state and of the output.
@@ -102,16 +107,16 @@ def control_synth(
 
     def init(key: Key) -> Params:
         hidden = networks * width
-        read = jnp.zeros(control + space.env_mean.shape[0])
+        network_inputs = jnp.zeros(control + space.env_mean.shape[0])
         keys = jax.random.split(key, 6)
         return {
             "free": {
-                # Small: the proof costs −¼ BB', which damps the state from the start.
+                # Small, because the proof costs −¼ BB', which damps the state.
                 "B": 0.1 * jax.random.normal(keys[0], (body, hidden)),
                 "W": jax.random.normal(keys[1], (hidden, body)),
-                # Not X = 0, where the gradient of XX' vanishes and X would stay.
+                # Not 0, where the gradient of XX' vanishes and X would stay.
                 "X": 0.1 * jnp.eye(body),
-                # tanh 0 = 0 below the diagonal, exp 0 = 1 on it: P = I at the start.
+                # T is 0 below the diagonal and exp 0 = 1 on it, so P = I at the start.
                 "Y": jnp.zeros((body, body)),
                 "T": jnp.zeros((body, body)),
                 "log_multipliers": jnp.zeros(hidden),
@@ -121,10 +126,10 @@ def control_synth(
                 "linear": jnp.zeros((3, body)),
                 "outer": 0.1 * hidden**-0.5 * jax.random.normal(keys[3], (3, hidden)),
                 "inner": jax.random.normal(keys[4], (hidden, body)),
-                # Spread over the range, or all units would bend at the same state.
+                # Spread over the range, or all units would saturate at the same state.
                 "offsets": jnp.linspace(-1.0, 1.0, hidden),
             },
-            "inputs": inputs.init(keys[5], read)["params"],
+            "inputs": inputs.init(keys[5], network_inputs)["params"],
         }
 
     def fiber(params: Params, env: Environment) -> ControlSynthFiber:
@@ -136,8 +141,9 @@ def control_synth(
         fiber: ControlSynthFiber, body: Float[Array, " body"], control: Control
     ) -> Float[Array, " rates"]:
         # Inputs are only added, or the contraction would depend on them.
-        read = jnp.concatenate([control, fiber.env])
-        added = cast(jax.Array, inputs.apply({"params": fiber.inputs}, read))
+        network_inputs = jnp.concatenate([control, fiber.env])
+        added = inputs.apply({"params": fiber.inputs}, network_inputs)
+        added = cast(jax.Array, added)
         return jnp.concatenate([fiber.twist(body), fiber.change(body)]) + added
 
     learned = Rates(init, rates, fiber)
@@ -154,28 +160,29 @@ def contracting(free: Params, rate: float) -> Synthesis:
     T = jnp.tril(entries, -1) + jnp.diag(jnp.exp(jnp.diag(entries)))
     T_inverse = jnp.linalg.inv(T)
     P = T.T @ T
-    # Multipliers as exponentials: positive without a constraint.
+    # The multipliers are exponentials, hence positive without a constraint.
     roots = GAIN * hidden**-0.5 * jnp.exp(0.5 * free["log_multipliers"])
     # Scaled by the width, so that norms do not grow with the number of units.
     B = hidden**-0.5 * free["B"]
     W = GAIN * hidden**-0.5 * free["W"]
     A = B - W.T
-    # The skew part turns without growth: it cancels in the symmetric inequality.
+    # The skew part cancels in the symmetric inequality: it turns without growth.
     linear = free["Y"] - free["Y"].T - 0.25 * B @ B.T - 0.5 * free["X"] @ free["X"].T
     norms = jnp.stack([jnp.linalg.norm(part) for part in (linear, A, W)])
     # How much rounding may disturb the inequality, from norms alone.
     size = rate + jnp.sum(norms) + jnp.sum(norms[1:] ** 2)
     slack = ROUNDING * jnp.sum(T**2) * jnp.sum(T_inverse**2) * size
-    # The margin is no design variable: gradients through it only add noise.
+    # The margin is no design variable, and gradients through it only add noise.
     linear -= (rate + jax.lax.stop_gradient(slack)) * jnp.eye(body)
     return Synthesis(
-        # Undo the congruence with T: the proof is in coordinates T s, the model in s.
+        # The proof is in the coordinates T s, the model in s.
         linear=T_inverse @ linear @ T,
         outer=T_inverse @ A * roots,
         inner=W @ T / roots[:, None],
-        # Free: they are outside the matrix inequality.
+        # The offsets are not in the matrix inequality.
         offsets=free["offsets"],
-        # Symmetric up to rounding only; an eigenvalue check would read one triangle.
+        # P is symmetric up to rounding only, and an eigenvalue check would read one
+        # triangle.
         metric=0.5 * (P + P.T),
         multipliers=roots**2,
     )

@@ -1,4 +1,4 @@
-"""Networks with a bound in z: sandwich layers, Gram bound, biases and the encoder."""
+"""Networks with a Lipschitz bound in z: sandwich layers, Gram bound, encoder."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ FLOAT32_MARGIN = 1e-5
 """Relative margin for float32 rounding inside the Gram iteration (measured: 2.2e-6)."""
 GRAM_ITERATIONS = 6
 CAYLEY_RANGE = 8.0
-"""Largest 2-norm of the free matrices; beyond it I + Z is too ill-conditioned for
+"""Largest 2-norm of the free matrices. Beyond it, I + Z is too ill-conditioned for
 orthogonality in float32.
 """
 SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
-"""Initial weights of heads whose output should start close to its bias."""
+"""Initial weights of a head whose output should start close to its bias."""
 FRAMES = ("body", "path")
 """Coordinates of a model: those of the world, or those along a path, without a pose."""
 
 
 class Weights(NamedTuple):
-    """W_1 … W_L of W_L σ(… σ(W_1 z + b_1) …) + b_L and λ_1 … λ_{L-1} of its bound.
+    """Weights of the network W_L σ(… σ(W_1 z + b_1) …) + b_L.
 
-    Without matrices it is the function 0; without a bound there are no multipliers.
+    Attributes:
+        matrices: W_1 … W_L; () for the function 0.
+        multipliers: λ_1 … λ_{L-1} of the Lipschitz bound; () without a bound.
     """
 
     matrices: tuple[Float[Array, "_ _"], ...] = ()
@@ -69,7 +71,8 @@ class Sandwich(nn.Module):
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
         """Return explicit weights for the Lipschitz bound γ."""
-        # A little less than asked for: rounding in the products may add to the norm.
+        # A little below the bound, because rounding in the products may add to the
+        # norm.
         gamma = jnp.asarray(bound) * (1.0 - FLOAT32_MARGIN)
         sizes = (self.inputs, *self.hidden, self.outputs)
         spread = nn.initializers.lecun_normal()
@@ -80,14 +83,15 @@ class Sandwich(nn.Module):
         for k, (before, after) in enumerate(pairwise(sizes)):
             square = self.param(f"square_{k}", spread, (after, after))
             tall = self.param(f"tall_{k}", spread, (before, after))
-            # Where the Cayley transform is orthogonal in float32, see CAYLEY_RANGE.
-            A, B = cayley(*(bounded(free, CAYLEY_RANGE) for free in (square, tall)))
-            # The last layer has no slope after it, so no Ψ and no factor √2.
+            square = bounded(square, CAYLEY_RANGE)
+            tall = bounded(tall, CAYLEY_RANGE)
+            A, B = cayley(square, tall)
+            # No slope follows the last layer, so it has no Ψ and no factor √2.
             if k == len(self.hidden):
                 matrices.append(jnp.sqrt(gamma) * B @ left)
                 break
             psi = self.param(f"psi_{k}", nn.initializers.zeros, (after,))
-            # Beyond e^±5 the multipliers ψ² leave what float32 resolves beside 1.
+            # Beyond e^±5, float32 does not resolve the multipliers ψ² beside 1.
             psi = jnp.exp(jnp.clip(psi, -5.0, 5.0))
             matrices.append(jnp.sqrt(2.0) * (B @ left) / psi[:, None])
             multipliers.append(gamma * psi**2)
@@ -96,7 +100,10 @@ class Sandwich(nn.Module):
 
 
 class Free(nn.Module):
-    """`Sandwich` without a bound, an ablation: certified only if it contracts."""
+    """`Sandwich` without a bound, for an ablation.
+
+    A model with it is certified only if it turns out to contract.
+    """
 
     inputs: int
     hidden: Sequence[int]
@@ -104,8 +111,11 @@ class Free(nn.Module):
 
     @nn.compact
     def __call__(self, bound: Scalar | float) -> Weights:
-        """Return plain weights; the bound is ignored."""
-        # The signature of `Sandwich`: the ablation exchanges the class alone.
+        """Return plain weights; the bound is ignored.
+
+        The signature is that of `Sandwich`, so that the ablation exchanges the class
+        alone.
+        """
         sizes = pairwise((self.inputs, *self.hidden, self.outputs))
         spread = nn.initializers.lecun_normal()
         matrices = tuple(
@@ -118,8 +128,13 @@ class Free(nn.Module):
 class Encoder(nn.Module):
     """φ(s, ψ(e)) = W_0 s + W_2 tanh(W_1 [s; ψ(e)] + b_1) + b_2.
 
-    The read-out of s is linear in z: a lift that contains s itself, W_0 s, need not
-    reconstruct it from saturating functions. Without `linear` it is left out.
+    The read-out of s is linear in z. With W_0 s the lift contains s itself, which need
+    not be reconstructed from saturating functions.
+
+    Attributes:
+        rank: size of z.
+        hidden: width.
+        linear: whether W_0 s is included.
     """
 
     rank: int
@@ -133,33 +148,42 @@ class Encoder(nn.Module):
         """Return z before rotation, shape (rank,)."""
         # e enters through its embedding, so that the lift may differ by environment.
         hidden = nn.tanh(nn.Dense(self.hidden)(jnp.concatenate([body, embedding])))
-        # Not one layer on [s; hidden]: the ablation drops W_0 s and nothing else.
+        # W_0 and W_2 are separate layers, so that the ablation drops W_0 s and nothing
+        # else.
         z = nn.Dense(self.rank)(hidden)
-        return z + nn.Dense(self.rank, use_bias=False)(body) if self.linear else z
+        if not self.linear:
+            return z
+        return z + nn.Dense(self.rank, use_bias=False)(body)
 
 
 def gram_bound(
     matrix: Float[Array, "rows columns"], *, iterations: int = GRAM_ITERATIONS
 ) -> Scalar:
-    """Return an upper bound on ||M||_2, too large by a factor r^(1/2^(k+1)) at most.
+    """Return an upper bound on ||M||_2 of a matrix M of rank r.
 
-    Gram iteration: G_0 = M, G_{k+1} = G_k' G_k rescaled to unit Frobenius norm; ||M||_2
-    ≤ ||G_k||_F^(1/2^k), scales undone. It needs no singular vectors, so the gradient is
-    finite at repeated singular values. Source: Delattre et al., arXiv 2305.16173.
+        G_0 = M,   G_{k+1} = G_k' G_k,   ||M||_2 ≤ ||G_k||_F^(1/2^k)
+
+    The bound is too large by a factor r^(1/2^(k+1)) at most. In this Gram iteration
+    every G_k is scaled to unit Frobenius norm, and the scales are multiplied at the
+    end. It needs no singular vectors, so the gradient is finite at repeated singular
+    values. Source: Delattre et al., arXiv 2305.16173.
     """
 
-    def square(k: Any, known: tuple[Array, Scalar]) -> tuple[Array, Scalar]:
-        gram = known[0].T @ known[0]
+    def square(k: Any, carry: tuple[Array, Scalar]) -> tuple[Array, Scalar]:
+        before, log_norm = carry
+        gram = before.T @ before
         scale = _frobenius(gram)
         # A Gram step squares the norm, so each later scale counts half as much.
-        return gram / scale, known[1] + 0.5**k * jnp.log(scale)
+        return gram / scale, log_norm + 0.5**k * jnp.log(scale)
 
+    # The matrix is scaled first, because the squares of very large or small entries
+    # leave the range of float32. So would a norm to the power 2^k, and the scales are
+    # kept as logarithms.
     scale = _frobenius(matrix)
-    # Unit norm first: squaring very large or small entries leaves float32. Scales are
-    # kept as logarithms: a norm to the power 2^k leaves it as well.
     first = square(1.0, (matrix / scale, jnp.log(scale)))
-    # A loop: unrolled, most of the time to compile a model is in here.
-    return jnp.exp(jax.lax.fori_loop(2, iterations + 1, square, first)[1])
+    # A loop that is not unrolled, since most of the time to compile a model is in here.
+    _, log_norm = jax.lax.fori_loop(2, iterations + 1, square, first)
+    return jnp.exp(log_norm)
 
 
 def bounded(
@@ -169,14 +193,16 @@ def bounded(
 
     A matrix with a Gram bound below ρ is returned as it is, up to the margin.
     """
-    # Both margins: the bound is above the norm, and the result below ρ, once rounded.
+    # With one margin the bound is above the norm after rounding, with the other one the
+    # result is below ρ.
     norm = gram_bound(matrix) * (1.0 + FLOAT32_MARGIN)
-    # The maximum leaves matrices inside the bound alone: there training is free.
+    # The maximum leaves matrices inside the bound as they are, so training is free
+    # there.
     return matrix * (bound * (1.0 - FLOAT32_MARGIN) / jnp.maximum(bound, norm))
 
 
 def _frobenius(matrix: Float[Array, "rows columns"]) -> Scalar:
-    """||M||_F, away from zero so that its logarithm and gradient exist."""
+    """Return ||M||_F, away from 0 so that its logarithm and gradient exist."""
     return jnp.sqrt(jnp.sum(matrix**2) + 1e-24)
 
 
@@ -188,7 +214,7 @@ def cayley(
     Z = X − X' + Y'Y,   A' = (I − Z)(I + Z)⁻¹,   B' = −2 Y (I + Z)⁻¹
     """
     identity = jnp.eye(square.shape[0])
-    # Skew plus positive semidefinite: I + Z is invertible for every X and Y.
+    # Z is skew plus positive semidefinite, so I + Z is invertible for every X and Y.
     Z = square - square.T + tall.T @ tall
     inverse = jnp.linalg.inv(identity + Z)
     return ((identity - Z) @ inverse).T, (-2.0 * tall @ inverse).T

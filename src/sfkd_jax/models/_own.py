@@ -25,41 +25,41 @@ def own(
     dt: float = 0.1,
     environment: bool = True,
 ) -> Model:
-    """Return what `package.module:function` makes of the scales of a data set.
+    """Return the model that `package.module:function` makes for a data set.
 
-    The function is called as function(space, **options). If it has arguments of these
-    names, it is given `dt`, `nominal` and `environment` as well.
+    The function is called as function(space, **options). If it has arguments named
+    `dt`, `nominal` or `environment`, these are passed as well.
 
     Args:
-        space: measured scales; fixes all sizes.
+        space: measured scales, which fix all sizes.
         nominal: (x, u, e) -> dx/dt of the known dynamics in physical units.
         factory: of the model, as package.module:function.
         options: more arguments of the factory.
         dt: sampling period [s].
-        environment: whether e is used. A factory without such an argument is given the
-            centre of E instead of e.
+        environment: whether e is used. If not, the model of a factory without such an
+            argument receives the centre of E instead of e.
     """
     function = imported(factory, SETTING)
-    # Somebody else's code may raise anything; a command prints one line.
+    # The code of others may raise anything, but a command prints one line.
     with _one_line(factory):
-        takes = inspect.signature(function).parameters
-        offered = {"dt": dt, "nominal": nominal, "environment": environment}
-        # Only what it asks for: a factory need not know our names.
-        given = {name: value for name, value in offered.items() if name in takes}
-        model = function(space, **given, **(options or {}))
+        parameters = inspect.signature(function).parameters
+        known = {"dt": dt, "nominal": nominal, "environment": environment}
+        # A factory need not have all of these arguments.
+        arguments = {name: known[name] for name in known if name in parameters}
+        model = function(space, **arguments, **(options or {}))
     if not isinstance(model, Model):
-        kind = type(model).__name__
+        returned = type(model).__name__
         raise ValueError(
-            f"{SETTING}={factory} returned {kind}, not sfkd_jax.types.Model"
+            f"{SETTING}={factory} returned {returned}, not sfkd_jax.types.Model"
         )
     with _one_line(factory):
         _check_shapes(model, space)
-    # A factory that does not know the switch is made blind from outside.
-    if environment or "environment" in takes:
+    if environment or "environment" in parameters:
         return model
 
+    # A factory that does not know the switch gets a model that ignores e.
     def fiber(params: Params, env: Environment) -> Fiber:
-        # The centre of E, not 0, which may be no environment at all (friction 0).
+        # The centre of E and not 0, which may be no environment at all (friction 0).
         return model.fiber(params, space.env_mean)
 
     return model._replace(fiber=fiber)
@@ -67,27 +67,28 @@ def own(
 
 @contextmanager
 def _one_line(factory: str) -> Iterator[None]:
-    """Turn whatever somebody else's code raises into one line about the setting."""
+    """Turn whatever the code of others raises into one line about the setting."""
     try:
         yield
     except Exception as reason:
-        # The first line alone: messages of jax run over pages.
+        # Only the first line, since messages of jax run over pages.
         first = next(iter(str(reason).splitlines()), "")
-        kind = type(reason).__name__
-        raise ValueError(f"{SETTING}={factory}: {kind}: {first}") from reason
+        error = type(reason).__name__
+        raise ValueError(f"{SETTING}={factory}: {error}: {first}") from reason
 
 
 def _check_shapes(model: Model, space: Space) -> None:
-    """Trace one step of a model, so that a wrong shape shows before it is trained."""
-    sizes = (3 + space.body_mean.size, space.control_mean.size, space.env_mean.size)
-    state, control, env = map(jnp.zeros, sizes)
+    """Trace one step of a model, so that a wrong shape shows before the training."""
+    state = jnp.zeros(3 + space.body_mean.size)
+    control = jnp.zeros(space.control_mean.size)
+    env = jnp.zeros(space.env_mean.size)
 
     def one_step(key: Key) -> State:
         fiber = model.fiber(model.init(key), env)
         latent = model.step(fiber, model.encode(fiber, state), control)
         return model.decode(fiber, latent)
 
-    # On shapes only: nothing is compiled, whatever a step costs.
+    # Only shapes are evaluated; nothing is compiled.
     after = jax.eval_shape(one_step, jax.random.key(0))
     if after.shape != state.shape:
         raise ValueError(f"a step makes a state of {state.shape} one of {after.shape}")

@@ -1,4 +1,4 @@
-"""What planners roll out in place of a certified model: its steps with a residual."""
+"""The model that planners roll out: the steps of the certified one with a residual."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import PATH_SPEED, PathState, compose, path_state
-from sfkd_jax.models._continuous import state_model
+from sfkd_jax.models._state_model import state_model
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import (
     BODY,
@@ -28,38 +28,51 @@ from sfkd_jax.types import (
 )
 
 FREE = 2
-"""Entries of a control that differ by sample; along a path κ and v_ref follow."""
+"""Number of entries of a control that differ between samples; along a path κ and v_ref
+follow them.
+"""
 HIDDEN = 64
-"""Hidden width of g in the frame of the car; along a known road half of it is enough."""
+"""Hidden width of g in the frame of the car; along a known road half is enough."""
 WIDTH = 64
 """Width of the network that gives the weights of g."""
 SCALE = 0.005
-"""Of M, N, m and V: g is small."""
+"""Factor of M, N, m and V, because g is small."""
 
 
 class Residual(NamedTuple):
     """(s, ν) ↦ P s + N ν + p + V tanh(W s + U ν + c), with the rows of both joined.
 
-    States are (s, 1): a vector that all samples share, added to one of each of them,
-    would turn the arrays of all samples around.
+    States are (s, 1). If a vector that all samples share were added to a vector of each
+    sample instead, XLA would transpose the arrays of all samples.
+
+    Attributes:
+        of_state: (P, p) above (W, c).
+        of_control: N above U.
+        V: output weights.
     """
 
-    of_state: Float[Array, "row state_plus_1"]  # (P, p), (W, c)
-    of_control: Float[Array, "row control"]  # N, U
+    of_state: Float[Array, "row state_plus_1"]
+    of_control: Float[Array, "row control"]
     V: Float[Array, "out hidden"]
 
     def __call__(
         self, state: Float[Array, " state_plus_1"], control: Float[Array, " control"]
     ) -> Float[Array, " out"]:
-        """Return its value."""
-        # Two products, since joining the inputs would copy those of every sample.
+        """Return the value at (s, 1) and ν."""
+        # Two products, since joining the inputs would copy the inputs of every sample.
         rows = self.of_state @ state + self.of_control @ control
         direct, hidden = jnp.split(rows, [self.V.shape[0]])
         return direct + self.V @ jnp.tanh(hidden)
 
 
 class PlanningFiber(NamedTuple):
-    """The fiber of F and g; of g weights and e, as long as its road is not known."""
+    """The fiber of F and g.
+
+    Attributes:
+        certified: of F.
+        residual: g; along a path, before the road is known, weights and scaled e that
+            determine it.
+    """
 
     certified: Fiber
     residual: Any
@@ -67,14 +80,14 @@ class PlanningFiber(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Planning:
-    """F with a residual g of no bound, for planners alone.
+    """F with a residual g that has no bound, for planners alone.
 
         x⁺ = D F(Φ(x), u; e) + g,   g = M s + N ν + m + V tanh(W s + U ν + c)
 
-    It goes back to the state at every step. A network of e, and along a path of κ and
-    v_ref, gives M to c, which all samples of a plan share. Along a path they share F as
-    well, linearised where a car on the path would be: of each sample one small layer is
-    left.
+    The model returns to the state at every step. A network of e, and along a path of κ
+    and v_ref as well, gives M to c, which all samples of a plan share. Along a path
+    they also share F, linearised at a car on the path, so one small layer is left for
+    each sample.
 
     Attributes:
         certified: F.
@@ -88,29 +101,31 @@ class Planning:
 
     @property
     def _hidden(self) -> int:
-        """Width of g."""
+        """Hidden width of g."""
         return HIDDEN // 2 if self.certified.along_path else HIDDEN
 
     @property
     def _sizes(self) -> tuple[int, list[int]]:
-        """Number of inputs of g, and the ends of its parts in the table."""
+        """Number of inputs of g, and the ends of its parts in the network's outputs."""
         body = self.space.body_mean.shape[0]
         # Along a path there is no pose: that of the start stays.
+        pose = 0 if self.certified.along_path else 3
         inputs = body + FREE
-        out = body + 3 * (not self.certified.along_path)
-        parts = out * (inputs + 1), self._hidden * (inputs + 1), out * self._hidden
-        return inputs, list(accumulate(parts))
+        outputs = body + pose
+        affine = outputs * (inputs + 1)
+        hidden = self._hidden * (inputs + 1)
+        return inputs, list(accumulate([affine, hidden, outputs * self._hidden]))
 
     @property
     def _network(self) -> nn.Sequential:
-        """The network of e and the road, whose g is zero at first."""
-        inputs, (affine, hidden, size) = self._sizes
+        """The network of e and the road. Its initial g is 0."""
+        inputs, (affine_end, hidden_end, size) = self._sizes
 
         def start(key: Key, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
-            # W, U and c alone: with V at zero as well, g would have no gradient.
+            # W, U and c are not 0: with V they would otherwise have no gradient.
             drawn = jax.random.normal(key, shape, dtype) / inputs**0.5
             rows = jnp.arange(size)
-            return jnp.where((rows >= affine) & (rows < hidden), drawn, 0.0)
+            return jnp.where((rows >= affine_end) & (rows < hidden_end), drawn, 0.0)
 
         layers = [nn.Dense(WIDTH), nn.tanh, nn.Dense(WIDTH), nn.tanh]
         last = nn.Dense(size, kernel_init=nn.initializers.zeros, bias_init=start)
@@ -119,16 +134,19 @@ class Planning:
     def init(self, key: Key) -> Params:
         """Draw parameters of F, and those of g as its entry "planning"."""
         road = self.space.control_mean[FREE:].shape[0]
-        reads = jnp.zeros(road + self.space.env_mean.shape[0])
-        # Another stream: those of F are drawn as without it.
-        added = self._network.init(jax.random.fold_in(key, 2), reads)["params"]
-        return {**self.certified.init(key), "planning": added}
+        inputs = jnp.zeros(road + self.space.env_mean.shape[0])
+        # From another key, so that the parameters of F are those without g.
+        planning = self._network.init(jax.random.fold_in(key, 2), inputs)["params"]
+        return {**self.certified.init(key), "planning": planning}
 
     def fiber(self, params: Params, env: Environment) -> PlanningFiber:
-        """Return the fiber of F, and g or, before a road is known, what gives it."""
+        """Return the fiber of F and g, see `PlanningFiber`."""
         scaled = self.space.scaled_env(env, self.environment)
-        known = unfold(params)["planning"], scaled
-        residual = known if self.certified.along_path else self._residual(*known)
+        weights = unfold(params)["planning"]
+        if self.certified.along_path:
+            residual = (weights, scaled)
+        else:
+            residual = self._residual(weights, scaled)
         return PlanningFiber(self.certified.fiber(params, env), residual)
 
     def step(self, fiber: PlanningFiber, state: State, control: Control) -> State:
@@ -142,8 +160,10 @@ class Planning:
             return jnp.concatenate([pose, after[BODY] + added[BODY]])
         if isinstance(g, Residual):
             return g(state, nu)
-        # Of a single step a product with the tangent is less work than the tangent.
-        certified, at = self._on_path(fiber, road := control[FREE:])
+        # For a single step, a product with the derivative is less work than the
+        # derivative itself.
+        road = control[FREE:]
+        certified, at = self._on_path(fiber, road)
         before, change = jax.jvp(certified, at, (state[:-1] - at[0], nu))
         weights, env = g
         added = self._residual(weights, env, road)(state, nu)
@@ -157,18 +177,20 @@ class Planning:
         offset = certified(*at) - A @ at[0]
         g = self._residual(weights, env, road)
         size = A.shape[0]
-        # The entry 1 stays.
-        one = jnp.eye(size + 1)[-1:]
+        # One more row keeps the last entry of (ξ, 1) at 1.
+        last_row = jnp.eye(size + 1)[-1:]
         affine = jnp.column_stack([A, offset]) + g.of_state[:size]
         residual = Residual(
-            jnp.vstack([affine, one, g.of_state[size:]]),
-            jnp.vstack([B + g.of_control[:size], 0 * B[:1], g.of_control[size:]]),
-            jnp.vstack([g.V, 0 * g.V[:1]]),
+            of_state=jnp.vstack([affine, last_row, g.of_state[size:]]),
+            of_control=jnp.vstack(
+                [B + g.of_control[:size], 0 * B[:1], g.of_control[size:]]
+            ),
+            V=jnp.vstack([g.V, 0 * g.V[:1]]),
         )
         return fiber._replace(residual=residual)
 
     def _on_path(self, fiber: PlanningFiber, road: Control) -> tuple[Any, Any]:
-        """F on a road as (ξ, ν) ↦ ξ⁺, and ξ and ν of a car on the path."""
+        """Return F on a road as (ξ, ν) ↦ ξ⁺, and the ξ and ν of a car on the path."""
 
         def certified(xi: PathState, nu: Control) -> PathState:
             return self._certified(fiber, path_state(xi), jnp.append(nu, road))[BODY]
@@ -184,44 +206,76 @@ class Planning:
         planning = planning._replace(shared=F.shared, along_path=F.along_path)
         if F.along_path:
             planning = planning._replace(
-                encode=lambda fiber, state: jnp.append(state[BODY], 1.0),
-                decode=lambda fiber, latent: path_state(latent[:-1]),
-                observe=lambda fiber, latent, state: jnp.append(state[BODY], 1.0),
-                vector=lambda latent: latent[:-1],
+                encode=_encode_path,
+                decode=_decode_path,
+                observe=_observe_path,
+                vector=_path_vector,
                 on_road=self.on_road,
             )
         return F._replace(init=self.init, planning=planning)
 
     def _certified(self, fiber: PlanningFiber, state: State, control: Control) -> State:
-        """One step of F, from a state to a state."""
-        own = fiber.certified
-        latent = self.certified.encode(own, state)
-        return self.certified.decode(own, self.certified.step(own, latent, control))
+        """Return the state after one step of F."""
+        F = self.certified
+        latent = F.encode(fiber.certified, state)
+        return F.decode(fiber.certified, F.step(fiber.certified, latent, control))
 
     def _residual(
         self, weights: Params, env: Environment, road: Control | None = None
     ) -> Residual:
-        """Return g of scaled e and a road, in the units of states and controls."""
+        """Return g in the units of states and controls.
+
+        Args:
+            weights: of the network.
+            env: scaled e.
+            road: κ [1/m] and v_ref [m/s]; None in the frame of the car.
+        """
         space = self.space
         inputs, ends = self._sizes
-        reads = env
+        network_inputs = env
         if road is not None:
             mean = space.control_mean[FREE:]
             scale = space.control_scale[FREE:]
-            reads = jnp.append((road - mean) / scale, env)
-        table = cast(Array, self._network.apply({"params": weights}, reads))
-        affine, hidden, out = jnp.split(table, ends[:-1])
-        affine, hidden = (part.reshape(-1, inputs + 1) for part in (affine, hidden))
+            network_inputs = jnp.append((road - mean) / scale, env)
+        outputs = self._network.apply({"params": weights}, network_inputs)
+        affine, hidden, last = jnp.split(cast(Array, outputs), ends[:-1])
+        affine = affine.reshape(-1, inputs + 1)
+        hidden = hidden.reshape(-1, inputs + 1)
         mean = jnp.append(space.body_mean, space.control_mean[:FREE])
         scale = jnp.append(space.body_scale, space.control_scale[:FREE])
         units = jnp.asarray(space.body_scale)
         if not self.certified.along_path:
             units = jnp.append(space.increment_scale, units)
         units = SCALE * units[:, None]
-        # Inputs in their own units: a rollout scales none of its own.
+        # The inputs of g are in physical units, so that a rollout scales none.
         rows = jnp.vstack([units * affine, hidden])
         gains = rows[:, :-1] / scale
         of_state, of_control = jnp.split(gains, [space.body_mean.shape[0]], axis=1)
         offset = rows[:, -1] - gains @ mean
-        V = units * out.reshape(-1, self._hidden)
-        return Residual(jnp.column_stack([of_state, offset]), of_control, V)
+        return Residual(
+            of_state=jnp.column_stack([of_state, offset]),
+            of_control=of_control,
+            V=units * last.reshape(-1, self._hidden),
+        )
+
+
+def _encode_path(fiber: PlanningFiber, state: State) -> Float[Array, " _"]:
+    """Return (ξ, 1)."""
+    return jnp.append(state[BODY], 1.0)
+
+
+def _decode_path(fiber: PlanningFiber, latent: Float[Array, " _"]) -> State:
+    """Return the state of (ξ, 1)."""
+    return path_state(latent[:-1])
+
+
+def _observe_path(
+    fiber: PlanningFiber, latent: Float[Array, " _"], state: State
+) -> Float[Array, " _"]:
+    """Return (ξ, 1) of a state."""
+    return _encode_path(fiber, state)
+
+
+def _path_vector(latent: Float[Array, " _"]) -> PathState:
+    """Return ξ."""
+    return latent[:-1]

@@ -28,19 +28,19 @@ class Checkpoints:
         def score(metrics: dict[str, float]) -> float:
             return metrics["validation_loss"]
 
-        # Both: the best is the result, the latest is what a resumed run starts from.
+        # The best state is the result; a resumed run starts from the latest one.
         best = managers.BestN(get_metric_fn=score, reverse=True, n=1)
         kept = managers.AnyPreservationPolicy([managers.LatestN(1), best])
         options = ocp.CheckpointManagerOptions(
             preservation_policy=kept,
             best_fn=score,
             best_mode="min",
-            # Left by a process that was killed while it saved.
+            # A process that was killed while it saved leaves such directories.
             cleanup_tmp_directories=True,
-            # Synchronous: once `save` returns, a signal may end the process.
+            # Once `save` returns, a signal may end the process.
             enable_async_checkpointing=False,
         )
-        # Absolute, since a command may change its working directory.
+        # The path is absolute, since a command may change its working directory.
         self._manager = ocp.CheckpointManager(directory.resolve(), options=options)
 
     def save(self, step: int, state: Any, validation_loss: float) -> None:
@@ -71,9 +71,10 @@ class Checkpoints:
 
     def resume(self, like: Any) -> Any:
         """Return the newest state, or `like` if there is no state."""
-        if (step := self.latest_step()) is None:
+        step = self.latest_step()
+        if step is None:
             return like
-        # Every array that orbax had not read yet prints a traceback of its own.
+        # After an error, every array that orbax has not read yet prints a traceback.
         with redirect_stderr(StringIO()):
             try:
                 return self.restore(step, like)
@@ -86,10 +87,10 @@ class Checkpoints:
 
     def restore(self, step: int, like: Any) -> Any:
         """Return the state saved at `step`, with the structure and types of `like`."""
-        # Shapes and types of `like`, so that a restored state fits the compiled step.
+        # With the shapes and types of `like`, a restored state fits the compiled step.
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         state = self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
-        # Free of the device that orbax commits it to, which would compile all again.
+        # Orbax commits the state to a device, with which all would be compiled again.
         return jax.tree.map(jnp.asarray, jax.device_get(state))
 
     def close(self) -> None:

@@ -24,8 +24,9 @@ class Loss(NamedTuple):
 
     Attributes:
         evaluate: (params, windows) -> loss, its parts, and the prediction error of each
-            window with the default weights, whatever is trained with.
-        validate: the same, compiled, so that all who validate share a program.
+            window. That error has the default weights, whatever weights are trained
+            with.
+        validate: the same, compiled, so that all callers share a program.
     """
 
     evaluate: Callable[[Params, Trajectory], Evaluated]
@@ -37,7 +38,7 @@ class Loss(NamedTuple):
 
 
 GROWTH = 0.5
-"""Of the weights of later steps, by default."""
+"""Default growth of the errors with the steps, see `multi_step_loss`."""
 YAW_LENGTH = 5.0
 """Weight of 1 rad of yaw in the loss [m]: the distance driven in half a second at the
 benchmark's speed.
@@ -46,7 +47,8 @@ benchmark's speed.
 
 def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
     """Return (mean |x|^p)^(1/p), a smooth maximum that does not overflow in float32."""
-    # Powers of ratios at most 1; the largest value itself carries no gradient.
+    # The powers are those of ratios that are at most 1. The largest value is a constant
+    # for the gradient.
     largest = jax.lax.stop_gradient(jnp.max(values))
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
 
@@ -54,14 +56,16 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
 def error_units(model: Model, space: Space) -> Float[Array, " state"]:
     """Return factors that convert each of `state_errors` to metres.
 
-    1 for the position, 5 m for a radian of yaw, 0.2 m for the half width of any other
-    entry. Along a path, e_y and e_ψ are position and yaw; the other entries do not
-    affect the position directly and count 0.05 m.
+    The factor is 1 for the position, 5 m for a radian of yaw, and 0.2 m for the half
+    width of any other entry. Along a path, e_y and e_ψ are position and yaw. The other
+    entries do not affect the position directly, and their half widths count 0.05 m.
     """
-    # Yaw rate, slip and steering move the car along a path only in later steps.
-    others = (0.05 if model.along_path else 0.2) / jnp.asarray(space.body_scale)
     if model.along_path:
+        # Yaw rate, slip and steering move the car along a path only in later steps.
+        others = 0.05 / jnp.asarray(space.body_scale)
         others = others.at[LATERAL].set(1.0).at[HEADING].set(YAW_LENGTH)
+    else:
+        others = 0.2 / jnp.asarray(space.body_scale)
     return jnp.concatenate([jnp.asarray([1.0, 1.0, YAW_LENGTH]), others])
 
 
@@ -84,31 +88,32 @@ def multi_step_loss(
             + Σ_i λ_i (|c_i| q(|d|) / (1 − α))²_W
 
     W measures position in units of 0.01 m at the first step. Errors grow about linearly
-    with k: divided by this growth, the near steps, on which the planner depends most,
-    weigh as much as the far ones. The one-step term, in units of 0.001 m, sees what the
-    sums over a window hide: slip, a lateral millimetre per step. The last sum is the
-    infinite-horizon tube of a certificate: c_i is row i of the read-out, q the 8th
-    power mean over the batch instead of the quantile of calibration.
+    with k. Divided by this growth, the near steps, on which a planner depends most,
+    weigh as much as the far ones. The one-step term, in units of 0.001 m, includes what
+    the sums over a window hide, such as a slip of a lateral millimetre per step. The
+    last sum is about the infinite-horizon tube of a certificate. c_i is row i of the
+    read-out, and q is the 8th power mean over the batch, in place of the quantile of a
+    calibration.
 
     Args:
         model: to be trained.
-        space: its scales.
+        space: scales of the model.
         prediction: λ_p, of free-running predictions; 0 leaves the one-step loss alone.
         one_step: λ_1, of predictions from the true state one step before.
-        consistency: λ_c, of the one-step latent defect: larger gives a tighter tube and
-            a less accurate model, see `docs/certificate.md`.
+        consistency: λ_c, of the one-step latent defect d. A larger weight gives a
+            tighter tube and a less accurate model, see `docs/certificate.md`.
         reconstruction: λ_r.
         transport: λ_t, with e' the environment of another window.
         growth: γ.
-        tube: λ_i of the first entries of the body state; () for none. For a model with
-            a contraction rate by construction.
+        tube: λ_i of the first entries of the body state; () for none. It needs a model
+            with a contraction rate by construction.
 
     Returns:
-        The loss; with `tube` one of its parts is the first radius.
+        The loss. With `tube` one of its parts is the first radius.
     """
-    known: Any = model.structure
+    structure: Any = model.structure
     # The infinite-horizon radius divides by 1 − α, so α must be known in training.
-    if tube and None in (known.rate, known.explicit):
+    if tube and None in (structure.rate, structure.explicit):
         raise ValueError(
             "training.loss.tube needs model=sfkd…, which contracts by construction"
         )
@@ -118,7 +123,6 @@ def multi_step_loss(
             f"the body state {space.body_mean.shape[0]} entries"
         )
     units = error_units(model, space)
-    window = partial(_window_parts, model, space, units, growth)
     weights = {
         "prediction": prediction,
         "one_step": one_step,
@@ -128,28 +132,30 @@ def multi_step_loss(
     }
 
     def evaluate(params: Params, batch: Trajectory) -> Evaluated:
-        # The e of another window: transport is trained between unlike environments.
+        # The e of another window, so that transport is trained between environments
+        # that differ.
         others = jnp.roll(batch.envs[:, -1], 1, axis=0)
-        # Its bounds are enforced once for all that reads the weights.
+        # The bounds of the weights are enforced once, for all uses of the weights.
         params = fold(model, params)
-        parts = jax.vmap(window, in_axes=(None, 0, 0))(params, batch, others)
-        scores = parts.pop("score")
-        gaps = parts.pop("gap")
+        window = partial(_window_parts, model, space, units, growth, params)
+        parts, scores, defects = jax.vmap(window)(batch, others)
         parts = {name: jnp.mean(part) for name, part in parts.items()}
-        start = jnp.zeros(())
-        # After the mean over windows: a tube belongs to the batch, not to one of them.
+        total = jnp.zeros(())
+        radii = None
         if tube:
-            # |c_i| q(|d|) / (1 − α) of the first entries, in their units.
-            rows = known.explicit(params).readout[: len(tube)]
-            size = jnp.linalg.norm(rows, axis=1) * power_mean(gaps)
-            radii = size / (1.0 - known.rate(params))
+            # |c_i| q(|d|) / (1 − α) of the first entries, in their units. A tube
+            # belongs to the batch and not to one of its windows.
+            rows = structure.explicit(params).readout[: len(tube)]
+            size = jnp.linalg.norm(rows, axis=1) * power_mean(defects)
+            radii = size / (1.0 - structure.rate(params))
             scaled = radii * units[BODY][: len(tube)] / 0.01
-            start = jnp.sum(jnp.asarray(tube) * scaled**2)
-        # A part without a weight here, the penalty, has brought its own.
-        total = sum(
-            (weights.get(name, 1.0) * part for name, part in parts.items()), start
-        )
-        return total, parts | {"tube": radii[0]} if tube else parts, scores
+            total = jnp.sum(jnp.asarray(tube) * scaled**2)
+        for name, part in parts.items():
+            # The penalty of a model has its own weight, and none here.
+            total = total + weights.get(name, 1.0) * part
+        if radii is not None:
+            parts["tube"] = radii[0]
+        return total, parts, scores
 
     return Loss(evaluate, jax.jit(evaluate))
 
@@ -157,14 +163,15 @@ def multi_step_loss(
 def one_step_loss(model: Model) -> Loss:
     """Return the mean square error of single steps, relative to their "scale".
 
-    That is an entry of the parameters, see `models.one_step`: what least squares left.
+    The scale is an entry of the parameters: the standard deviations of the residuals of
+    least squares, see `models.one_step`.
     """
 
     def error(params: Params, data: Trajectory) -> Scalar:
         after = rollout(model, params, data).single
-        # In the frame of the car, as the scale is.
-        gap = state_errors(after, data.states[1:])
-        return jnp.mean((gap / jax.lax.stop_gradient(params["scale"])) ** 2)
+        # Errors and scale are in the frame of the car.
+        errors = state_errors(after, data.states[1:])
+        return jnp.mean((errors / jax.lax.stop_gradient(params["scale"])) ** 2)
 
     return _mean_of(error)
 
@@ -172,24 +179,24 @@ def one_step_loss(model: Model) -> Loss:
 def planning_loss(model: Model, params: Params, space: Space) -> Loss:
     """Return the mean square error of single steps of `model.planning` [mm²].
 
-    Its weights alone are varied. Along a path z is the state, so that a rollout is
-    right where its steps are.
+    The parameters of the loss are the weights of the residual alone. Along a path z is
+    the state, so a rollout is right where its steps are.
     """
-    # Folded, since what is certified is frozen.
     units = error_units(model, space) / 0.001
+    # The certified weights are frozen, so they are folded once.
     frozen = fold(model, params)
-    planning = model.planning or model
+    planning = model if model.planning is None else model.planning
 
     def error(weights: Params, data: Trajectory) -> Scalar:
-        own = Folded({**params, "planning": weights}, frozen.shared)
-        after = rollout(planning, own, data).single
+        folded = Folded({**params, "planning": weights}, frozen.shared)
+        after = rollout(planning, folded, data).single
         return jnp.mean((state_errors(after, data.states[1:]) * units) ** 2)
 
     return _mean_of(error)
 
 
 def _mean_of(error: Callable[[Params, Trajectory], Scalar]) -> Loss:
-    """The loss that is the mean of an error over the windows of a batch."""
+    """Return the loss that is the mean of an error over the windows of a batch."""
 
     def evaluate(params: Params, batch: Trajectory) -> Evaluated:
         errors = jax.vmap(error, in_axes=(None, 0))(params, batch)
@@ -206,38 +213,50 @@ def _window_parts(
     params: Params,
     data: Trajectory,
     other: Environment,
-) -> dict[str, Array]:
-    """The parts of the loss of one window; `other` is another window's environment."""
-    known = rollout(model, params, data)
-    errors = state_errors(known.free, data.states[1:])
+) -> tuple[Parts, Scalar, Float[Array, " time"]]:
+    """Evaluate the loss of one window.
+
+    Args:
+        model: to be trained.
+        space: scales of the model.
+        units: of `state_errors`, see `error_units`.
+        growth: γ.
+        params: of the model.
+        data: the window.
+        other: environment of another window.
+
+    Returns:
+        The parts of the loss, the prediction error with the default weights, and |d|.
+    """
+    predicted = rollout(model, params, data)
+    errors = state_errors(predicted.free, data.states[1:])
 
     def prediction(growth: float) -> Scalar:
-        # Errors grow about linearly; without this the far steps would decide alone.
+        # Errors grow about linearly. Without this factor the far steps would decide.
         steps = 1.0 + growth * jnp.arange(errors.shape[0])
         weighted = (errors * units / 0.01 / steps[:, None]) ** 2
         return jnp.mean(jnp.sum(weighted, axis=1))
 
-    # In millimetres: a slip of one a step hides in the sums over a window.
-    near = state_errors(known.single, data.states[1:]) * units / 0.001
-    # That of the first step: the regularisers below are about the first state.
-    fiber = jax.tree.map(lambda leaf: leaf[0], known.fibers)
-    there = model.fiber(params, other)
-    here = model.encode(fiber, data.states[0])
-    moved = model.vector(model.transport(fiber, there, here)) - model.vector(
-        model.encode(there, data.states[0])
-    )
-    rebuilt = (model.decode(fiber, here) - data.states[0])[BODY] / space.body_scale
+    # In millimetres: a slip of one millimetre a step hides in the sums over a window.
+    single = state_errors(predicted.single, data.states[1:]) * units / 0.001
+    # The regularisers are about the first state, and the fiber is that of its step.
+    fiber = jax.tree.map(lambda leaf: leaf[0], predicted.fibers)
+    other_fiber = model.fiber(params, other)
+    latent = model.encode(fiber, data.states[0])
+    transported = model.vector(model.transport(fiber, other_fiber, latent))
+    encoded = model.vector(model.encode(other_fiber, data.states[0]))
+    rebuilt = model.decode(fiber, latent)
+    body_error = (rebuilt - data.states[0])[BODY] / space.body_scale
     parts = {
         "prediction": prediction(growth),
-        "one_step": jnp.mean(jnp.sum(near**2, axis=1)),
-        "consistency": jnp.mean(jnp.sum(known.defects**2, axis=1)) / 1e-4,
-        "reconstruction": jnp.sum(rebuilt**2) / 1e-4,
-        "transport": jnp.sum(moved**2) / 1e-4,
+        "one_step": jnp.mean(jnp.sum(single**2, axis=1)),
+        "consistency": jnp.mean(jnp.sum(predicted.defects**2, axis=1)) / 1e-4,
+        "reconstruction": jnp.sum(body_error**2) / 1e-4,
+        "transport": jnp.sum((transported - encoded) ** 2) / 1e-4,
     }
     if model.fitting.penalty is not None:
-        parts["penalty"] = model.fitting.penalty(fiber, here, data.controls[0])
-    # Of free-running and of single steps, and what the model itself adds.
+        parts["penalty"] = model.fitting.penalty(fiber, latent, data.controls[0])
     score = prediction(GROWTH) + parts["one_step"] + parts.get("penalty", 0.0)
-    # Away from 0, where the root has no gradient.
-    size = jnp.sqrt(jnp.sum(known.defects**2, axis=1) + 1e-16)
-    return parts | {"score": score, "gap": size}
+    # The small number keeps the gradient of the root finite at 0.
+    sizes = jnp.sqrt(jnp.sum(predicted.defects**2, axis=1) + 1e-16)
+    return parts, score, sizes

@@ -22,9 +22,16 @@ ALPHA_START = 2.0
 
 
 class SharedWeights(NamedTuple):
-    """Weights that do not depend on e: vertices, the bounded networks, the read-out.
+    """Weights that do not depend on e, with every bound enforced.
 
-    `lift` is C⁻¹ where z is the state in other coordinates; None where φ lifts.
+    Attributes:
+        vertices: A_j.
+        residual: of the network r.
+        decoder: of the network D.
+        forcing: V in a tuple, or ().
+        readout: C.
+        centre: c.
+        lift: C⁻¹ where z is the state in other coordinates; None where φ lifts.
     """
 
     vertices: Float[Array, "vertex rank rank"]
@@ -37,21 +44,31 @@ class SharedWeights(NamedTuple):
 
     @property
     def ends(self) -> tuple[list[int], list[int]]:
-        """Where the layers end in both tables of `PerEnvironment`."""
+        """Rows at which the layers end in both tables of `PerEnvironment`."""
         decoder = self.decoder.matrices
         rank = self.readout.shape[1]
         hidden = (*self.residual.matrices[:-1], *decoder[:-1])
-        return list(accumulate(map(len, hidden))), [rank, rank + 3 * bool(decoder)]
+        hidden_ends = list(accumulate(map(len, hidden)))
+        decoder_outputs = 3 if decoder else 0
+        return hidden_ends, [rank, rank + decoder_outputs]
 
 
 class PerEnvironment(NamedTuple):
-    """Functions of e: mixture of the vertices, biases, rotation, embedding.
+    """Functions of e.
 
-    Biases are gain(e) u + offset(e). Those before a tanh are one table: of residual,
-    decoder, forcing; those of outputs another: residual with B(e) u, decoder, logits.
+    Biases are gain(e) u + offset(e), in two tables. The first one has the biases before
+    a tanh: of residual, decoder and forcing. The second one has those of outputs: of
+    the residual with B(e) u, of the decoder, and the logits of the mixture.
+
+    Attributes:
+        mixture: w; None if its logits are in the second table.
+        gains: of both tables.
+        offsets: of both tables.
+        tangents: of the rotation Q(e), see `rotate_planes`.
+        embedding: ψ(e).
     """
 
-    mixture: Float[Array, " vertex"] | None  # None if its logits are in the table
+    mixture: Float[Array, " vertex"] | None
     gains: tuple[Float[Array, "_ control"], ...]
     offsets: tuple[Float[Array, " _"], ...]
     tangents: Float[Array, " plane"]
@@ -68,7 +85,7 @@ class Learned(nn.Module):
         embedding: size of ψ(e).
         pose: whether there is a decoder of the pose.
         transport: whether Q(e) is learned; otherwise it is the identity.
-        kind: of the residual, see `RESIDUALS`.
+        residual_class: module of the residual, see `RESIDUALS`.
         joint: whether operators and residual are bounded as one map by α = ρ + β;
             otherwise A(e) is bounded by ρ and the residual by β.
         state_lift: whether z is the state, z = C⁻¹ (s − c); then rank = body.
@@ -86,7 +103,7 @@ class Learned(nn.Module):
     decoder_hidden: Sequence[int]
     rho: float
     beta: float
-    kind: type[Sandwich] | type[Free] | None
+    residual_class: type[Sandwich] | type[Free] | None
     joint: bool
     learn_alpha: bool
     forcing_hidden: int
@@ -95,27 +112,28 @@ class Learned(nn.Module):
 
     def setup(self) -> None:
         """Declare submodules and parameters; stored policies have these names."""
-        layers = (nn.Dense(64), nn.Dense(64), nn.Dense(self.embedding))
-        self.psi = nn.Sequential(
-            [part for layer in layers for part in (layer, nn.tanh)]
-        )
-        # Small heads: e has little influence until the data ask for it.
-        logits = self.vertices * (1 + self.control * self.scheduled)
+        layers = [nn.Dense(64), nn.tanh, nn.Dense(64), nn.tanh]
+        self.psi = nn.Sequential([*layers, nn.Dense(self.embedding), nn.tanh])
+        # With small weights of its head, e has little influence at the start.
+        logits = self.vertices
+        if self.scheduled:
+            logits = self.vertices * (1 + self.control)
         self.mixture_head = nn.Dense(logits, kernel_init=SMALL)
         self.input_head = nn.Dense(self.rank * self.control)
-        # A car whose state is its speed alone has no plane, but no layer is empty.
+        # A state that is the speed alone has no plane, but no layer may be empty.
         self.tangent_head = nn.Dense(max(self.rank // 2, 1), kernel_init=SMALL)
-        # Of every bias, a gain for each control and an offset.
+        # Every bias has a gain for each control, and an offset.
         entries = self.control + 1
-        # Weights of networks do not depend on e, only biases do: one bound for all e.
-        if self.kind is not None:
-            sizes = self.rank, self.residual_hidden, self.rank
-            self.residual_weights = self.kind(*sizes)
+        # Only the biases of networks depend on e, so one bound holds for all e.
+        if self.residual_class is not None:
+            self.residual_weights = self.residual_class(
+                self.rank, self.residual_hidden, self.rank
+            )
             self.residual_head = nn.Dense(
                 (sum(self.residual_hidden) + self.rank) * entries, kernel_init=SMALL
             )
         if self.pose:
-            # Three outputs, the increment of the pose, whatever the body state has.
+            # The three outputs are the increment of the pose.
             self.decoder_weights = Sandwich(self.rank, self.decoder_hidden, 3)
             self.decoder_head = nn.Dense((sum(self.decoder_hidden) + 3) * entries)
             self.log_decoder_bound = self.param(
@@ -124,12 +142,13 @@ class Learned(nn.Module):
         if self.forcing_hidden:
             self.forcing_head = nn.Dense(self.forcing_hidden * entries)
             self.forcing_weights = self.param(
-                # Zeros: the extension begins as the model without it.
+                # With zeros, the extension begins as the model without it.
                 "forcing",
                 nn.initializers.zeros,
                 (self.rank, self.forcing_hidden),
             )
-        # Flax numbers the keys of `param` by call: another order draws other weights.
+        # Flax numbers the keys of `param` by call, so another order would draw other
+        # weights.
         square = (self.rank, self.rank)
         self.operators = self.param(
             "operators", _near_identity, (self.vertices, *square)
@@ -148,43 +167,44 @@ class Learned(nn.Module):
     @property
     def bounded(self) -> bool:
         """Whether a step contracts by construction."""
-        return self.kind is not Free
+        return self.residual_class is not Free
 
     def rate(self) -> Scalar:
         """Return α = ρ + β, or less if it is learned."""
-        most = jnp.asarray(self.rho + self.beta)
-        # Without a joint budget α is a sum of two bounds that are given.
+        largest = jnp.asarray(self.rho + self.beta)
+        # Without a joint budget α is the sum of two settings.
         if not (self.joint and self.learn_alpha):
-            return most
-        # A sigmoid between fixed ends: no step of the optimiser leaves them.
-        return LOWEST_RATE + (most - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
+            return largest
+        # No step of the optimiser leaves the ends of the sigmoid.
+        return LOWEST_RATE + (largest - LOWEST_RATE) * nn.sigmoid(self.alpha_logit)
 
     def __call__(self, env: Array) -> tuple[SharedWeights, PerEnvironment]:
-        """Evaluate every part once, so that init creates all parameters."""
+        """Evaluate every part once, so that `init` creates all parameters."""
         return self.shared(), self.per_environment(env)
 
     def shared(self) -> SharedWeights:
         """Return the weights that do not depend on e, with every bound enforced."""
         if self.joint:
-            # φ bounded by 1: the couplings carry its gain, or α would count twice.
+            # φ is bounded by 1, since the couplings carry its gain; otherwise α would
+            # count twice.
             vertices, residual = share_budget(
                 self.operators, self.couplings, self.residual_weights(1.0), self.rate()
             )
         else:
             vertices = separate_budget(self.operators, self.rho)
             residual = Weights()
-            if self.kind is not None:
+            if self.residual_class is not None:
                 residual = self.residual_weights(self.beta)
-        # Norm at most 1 in scaled units: a ball in z bounds the body state.
+        # With norm at most 1 in scaled units, a ball in z bounds the body state.
         readout = bounded(self.readout, 1.0)
         decoder = Weights()
         if self.pose:
-            # The decoder feeds nothing back, so that its bound may be learned.
+            # The decoder feeds nothing back, so its bound may be learned.
             decoder = self.decoder_weights(jnp.exp(self.log_decoder_bound))
         return SharedWeights(
-            vertices,
-            residual,
-            decoder,
+            vertices=vertices,
+            residual=residual,
+            decoder=decoder,
             forcing=(self.forcing_weights,) if self.forcing_hidden else (),
             readout=readout,
             centre=self.centre,
@@ -194,14 +214,19 @@ class Learned(nn.Module):
     def per_environment(self, env: Float[Array, " environment"]) -> PerEnvironment:
         """Return the functions of e; `env` is scaled to about [-1, 1]."""
         embedding = self.psi(env)
-        tables = self._tables(lambda head: head(embedding))
+
+        def outputs_of(head: nn.Dense) -> Array:
+            return head(embedding)
+
+        tables = self._tables(outputs_of)
+        # On the simplex by construction: a mixture of contractions contracts.
         mixture = None if self.scheduled else nn.softmax(self.mixture_head(embedding))
         return PerEnvironment(
-            # On the simplex by construction: a mixture of contractions contracts.
             mixture=mixture,
             gains=tuple(table[:, :-1] for table in tables),
             offsets=tuple(table[:, -1] for table in tables),
-            # Evaluated in any case, so that the ablation has the same parameters.
+            # Evaluated even without transport, so that the ablation has the same
+            # parameters.
             tangents=self.tangent_head(embedding),
             embedding=embedding,
         )
@@ -209,20 +234,24 @@ class Learned(nn.Module):
     def bilinear(self) -> tuple[Float[Array, "row product"], ...]:
         """Return T of gain(e) u + offset(e) = T ([ψ(e); 1] ⊗ [u; 1]), of both tables.
 
-        For training, where every step of every window has its own e: gains of each of
-        them would be a hundred times as many numbers as a product of ψ and u.
+        It is for training, where every step of every window has its own e. The gains of
+        all of them would be a hundred times as many numbers as products of ψ and u.
         """
 
-        def weights(head: nn.Dense) -> Array:
-            own = head.variables["params"]
-            return jnp.vstack([own["kernel"], own["bias"]])
+        def weights_of(head: nn.Dense) -> Array:
+            params = head.variables["params"]
+            return jnp.vstack([params["kernel"], params["bias"]])
 
         # A table is linear in the outputs of the heads, hence in their weights.
-        parts = (jnp.moveaxis(table, 0, 1) for table in self._tables(weights))
-        return tuple(part.reshape(part.shape[0], -1) for part in parts)
+        tables = [jnp.moveaxis(table, 0, 1) for table in self._tables(weights_of)]
+        return tuple(table.reshape(table.shape[0], -1) for table in tables)
 
     def _tables(self, read: Callable[[nn.Dense], Array]) -> tuple[Array, ...]:
-        """Return [gain, offset] of the biases before a tanh, and of the others."""
+        """Return [gain, offset] of the biases before a tanh, and of the others.
+
+        Args:
+            read: head -> its outputs, or anything that is linear in them.
+        """
 
         def table(head: nn.Dense) -> Array:
             outputs = read(head)
@@ -232,7 +261,7 @@ class Learned(nn.Module):
         B = B.reshape(*B.shape[:-1], self.rank, self.control)
         outer = [jnp.concatenate([B, jnp.zeros_like(B[..., :1])], axis=-1)]
         hidden = [outer[0][..., :0, :]]
-        if self.kind is not None:
+        if self.residual_class is not None:
             rows = table(self.residual_head)
             hidden.append(rows[..., : -self.rank, :])
             outer[0] += rows[..., -self.rank :, :]
@@ -248,11 +277,11 @@ class Learned(nn.Module):
 
 
 def _couplings(key: Array, shape: tuple[int, ...]) -> Array:
-    """Initial couplings of norm 0.3: the initial gain of the residual is about 0.1."""
+    """Draw couplings of norm 0.3, for an initial gain of the residual of about 0.1."""
     return jax.random.normal(key, shape, jnp.float32) * (0.15 / shape[-1] ** 0.5)
 
 
 def _near_identity(key: Array, shape: tuple[int, ...]) -> Array:
-    """Initial operators: I plus noise, since a car changes little in 0.1 s."""
+    """Draw operators near the identity, since a car changes little in 0.1 s."""
     noise = jax.random.normal(key, shape, jnp.float32) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=jnp.float32) + noise

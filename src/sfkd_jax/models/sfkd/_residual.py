@@ -1,11 +1,13 @@
-"""The residual of SFKD and the bound of a step: all that depends on its kind.
+"""The residual of SFKD, and the bound of a step.
 
-A new kind is an entry of `RESIDUALS`: a flax module called like `Sandwich`. What it
-returns is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and
-the trusted core check, no other form. What planners alone add is `Planning`.
+A residual is an entry of `RESIDUALS`: a flax module that is called like `Sandwich`. Its
+value is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and the
+trusted core can check, no other form. What planners alone add is in `Planning`.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +22,8 @@ float32.
 """
 BUDGETS = ("joint", "sum")
 RESIDUALS = {"sandwich": Sandwich, "free": Free, "none": None}
-"""(inputs, hidden widths, outputs) -> flax module, by name; None: no residual. A step
-with a `Free` one does not contract by construction.
+"""(inputs, hidden widths, outputs) -> flax module, by name; None for no residual. With
+a `Free` residual a step does not contract by construction.
 """
 
 
@@ -29,8 +31,8 @@ def separate_budget(
     operators: Float[Array, "vertex rank rank"], rho: float
 ) -> Float[Array, "vertex rank rank"]:
     """Return A_j with ||A_j||_2 ≤ ρ, whatever the residual is."""
-    # Each vertex for itself: a mixture is then below ρ by convexity.
-    return jax.vmap(lambda matrix: bounded(matrix, rho))(operators)
+    # Each vertex is bounded, so a mixture is below ρ by convexity.
+    return jax.vmap(partial(bounded, bound=rho))(operators)
 
 
 def share_budget(
@@ -54,16 +56,14 @@ def share_budget(
     and the residual with G and α H folded into its last and first weights.
     """
     out, into = (bounded(matrix, LARGEST_COUPLING) for matrix in couplings)
-    # Cholesky factors instead of square roots: any L with L L' = I − G G' serves.
+    # Cholesky factors instead of square roots, since any L with L L' = I − G G' serves.
     identity = jnp.eye(out.shape[0])
     left = jnp.linalg.cholesky(identity - out @ out.T)
     right = jnp.linalg.cholesky(identity - into.T @ into)
-    # One pair (L, R) for all vertices: the residual is the same for each of them.
+    # All vertices share (L, R), since the residual is the same for each of them.
     vertices = alpha * left @ separate_budget(operators, 1.0) @ right.T
-    # Folded into the network, so that what is certified is what is multiplied.
+    # G and H become part of the network, so that the certified weights are those that
+    # are multiplied. α is at the input alone; at both ends it would count twice.
     first, *middle, last = network.matrices
-    return vertices, Weights(
-        # α at the input alone: at both ends it would count twice.
-        (alpha * first @ into, *middle, out @ last),
-        network.multipliers,
-    )
+    matrices = (alpha * first @ into, *middle, out @ last)
+    return vertices, Weights(matrices, network.multipliers)
