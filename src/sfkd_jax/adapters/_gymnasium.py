@@ -18,7 +18,7 @@ PROCESS = os.getpid()
 VIEW = 30.0
 """Half width of the view around the car [m]."""
 CORNERS = np.asarray([[1, 1], [1, -1], [-1, -1], [-1, 1]])
-"""Of a car, ahead and to the left of its centre, in shares of half its size."""
+"""Corners of a car, ahead and to the left of its centre, in shares of half its size."""
 
 
 def register_gymnasium() -> None:

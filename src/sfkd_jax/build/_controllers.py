@@ -233,9 +233,11 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
     # The filter relates forces to the largest one in E, which the box defines.
     if None in loop.env_box.values():
         raise ValueError("adaptation needs environment.low and environment.high")
-    own = arguments(settings.adaptation, control.Adaptation)
-    own["sensor_noise"] = own["sensor_noise"] or _noise_to_learn_from(loop.plant)
-    own["model_error"] = own["model_error"] or _error_of_known_states(loop.plant)
+    options = arguments(settings.adaptation, control.Adaptation)
+    if not options["sensor_noise"]:
+        options["sensor_noise"] = _noise_to_learn_from(loop.plant)
+    if not options["model_error"]:
+        options["model_error"] = _error_of_known_states(loop.plant)
     adaptation = control.Adaptation(
         inner=inner,
         # Without the offset, which the filter itself adds.
@@ -244,7 +246,7 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
         estimate_env=loop.estimates_env,
         **_limits(loop.plant),
         **loop.env_box,
-        **own,
+        **options,
     )
     return adaptation.controller()
 
@@ -252,7 +254,7 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
 def _noise_to_learn_from(plant: plants.Vehicle) -> tuple[float, ...]:
     """Return the deviations of the sensors of a vehicle, none of which may be exact."""
     # A filter weighs what it measures by these: an exact sensor would weigh infinitely.
-    exact = [one.name for one in plant.states if not one.deviation]
+    exact = [state.name for state in plant.states if not state.deviation]
     if exact:
         raise ValueError(
             f"adaptation needs the deviation of the sensor of {', '.join(exact)}: "
@@ -263,7 +265,7 @@ def _noise_to_learn_from(plant: plants.Vehicle) -> tuple[float, ...]:
 
 def _error_of_known_states(plant: plants.Vehicle) -> tuple[float, ...]:
     """Return the error of one step of a model, for each path coordinate."""
-    names = [one.name for one in plants.path_states(plant)[3:]]
+    names = [state.name for state in plants.path_states(plant)[3:]]
     unknown = [name for name in names if name not in MODEL_ERROR]
     if unknown:
         raise ValueError(

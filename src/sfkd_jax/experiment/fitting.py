@@ -44,8 +44,8 @@ def train_policy(settings: Settings, dataset: Dataset, data_hash: str) -> None:
     # The same model as that of `restore`, for which everything is then compiled.
     plant, model = policy.built(recorded)
     if settings.environment.is_known and not settings.logs:
-        usual = [one.label for one in plant.environment]
-        names = settings.environment.names or usual
+        labels = [entry.label for entry in plant.environment]
+        names = settings.environment.names or labels
         box = in_words(names, dataset.env_low, dataset.env_high)
         store.print_message(f"the model reads e: {box}")
     key = jax.random.fold_in(jax.random.key(settings.seed), 0)

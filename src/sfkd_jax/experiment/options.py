@@ -182,9 +182,9 @@ class EvaluationSettings:
         seed: of roads, sensors and samplers.
         systems: "self", which is the policy of the run, and reference systems by name.
             With an empty list `train` trains the model and does nothing else.
-        observation_noise: standard deviations by name of the state; None for that which
-            the vehicle states, see `plants.KNOWN_STATES`. Other states are measured
-            exactly.
+        observation_noise: standard deviations by name of the state. With None, and
+            for a state that is not named, it is that of the vehicle, see
+            `plants.KNOWN_STATES`.
         side_forces: largest side forces that no model knows [N]; the episodes are
             simulated once more under each.
     """
@@ -308,8 +308,8 @@ class Settings:
                 f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
                 f"the states of the vehicle are {', '.join(names)}"
             )
-        asked = {name: value for name, value in noise.items() if value is not None}
-        return tuple(asked.get(one.name, one.deviation) for one in plant.states)
+        stated = {name: value for name, value in noise.items() if value is not None}
+        return tuple(stated.get(state.name, state.deviation) for state in plant.states)
 
     @property
     def logs(self) -> LogSettings | None:

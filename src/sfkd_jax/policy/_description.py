@@ -20,17 +20,17 @@ def interface_of(
     # An environment that was measured in logs has names of its own.
     boxes = (certificate or {}).get("boxes", {})
     columns = boxes.get("names", {}).get("env")
-    usual = [one.label for one in vehicle.environment]
+    labels = [entry.label for entry in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
         "horizon": build.controller_horizon(trained.settings["controller"]),
         "controls": [
-            {"name": one.label, "low": one.low, "high": one.high}
-            for one in vehicle.controls
+            {"name": control.label, "low": control.low, "high": control.high}
+            for control in vehicle.controls
         ],
         "observation": list(vehicle.state_names),
         "environment": {
-            "names": columns or environment.get("names") or usual,
+            "names": columns or environment.get("names") or labels,
             "low": list(environment["low"]),
             "high": list(environment["high"]),
         },
@@ -43,7 +43,7 @@ def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
     vehicle = trained.vehicle
     interface = interface_of(trained, certificate)
     frame = "along a path" if trained.model.along_path else "in the world"
-    states = [one.label for one in vehicle.states]
+    states = [state.label for state in vehicle.states]
     controls = in_words(
         [control["name"] for control in interface["controls"]],
         [control["low"] for control in interface["controls"]],

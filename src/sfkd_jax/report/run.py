@@ -258,9 +258,11 @@ def _axes(record: dict[str, Any], policy: dict[str, Any]) -> dict[str, list[str]
     if not vehicle:
         return {}
     # No certificate of another frame has a corridor.
-    named = axes(build_vehicle(vehicle), along_path=bool(record.get("corridor")))
-    environment = dig(settings, "environment", "names")
-    return named | ({"env": environment} if environment else {})
+    names = axes(build_vehicle(vehicle), along_path=bool(record.get("corridor")))
+    env_names = dig(settings, "environment", "names")
+    if env_names:
+        names["env"] = env_names
+    return names
 
 
 def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]:
