@@ -213,8 +213,8 @@ class LatentModel:
         """Advance z and the pose by one sampling period."""
         terms = self._terms(fiber, control)
         shared = fiber.shared
-        residual = apply(shared.residual.matrices, terms.residual, latent.z)
-        z = terms.A @ latent.z + residual
+        linear = terms.A @ latent.z
+        z = linear + apply(shared.residual.matrices, terms.residual, latent.z)
         # Along a path there is no pose: that of the start stays.
         if not shared.decoder.matrices:
             return PosedLatent(latent.pose, z)
