@@ -28,8 +28,8 @@ CASE = "force, 3 s"
 PROTOCOL = {"episodes": 16, "seconds": 30.0, "seed": 2027}
 """Of `benchmarks.adaptation`, so that the episode is one of those in its table."""
 RECORDED = {
-    "estimate": lambda info: info["causes"][0],
-    "deviation": lambda info: info["causes_std"][0],
+    "estimate": lambda info: info.adaptation.causes[0],
+    "deviation": lambda info: info.adaptation.causes_std[0],
 }
 """Side force and its standard deviation, relative to the largest one in E."""
 

@@ -70,7 +70,7 @@ class Car:
     def program(self, name):
         """(scenarios) -> what is recorded of their episodes, (run, time)."""
         # The oracle claims nothing.
-        record = {"corridor": lambda info: info["corridor"]} if name != "oracle" else {}
+        record = {"corridor": lambda info: info.claim.bound} if name != "oracle" else {}
         episode = driving(
             self.plant, self.system(name), self.policy.params, record=record
         )

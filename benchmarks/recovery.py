@@ -22,6 +22,7 @@ from benchmarks.device import CARS, HORIZON, PERIOD
 from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.geometry import LATERAL, wrap_angle
+from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.types import Controller
 
 SPACING = 0.5
@@ -94,11 +95,10 @@ def request(law, low, high, now):
             jnp.full(2, jnp.nan),
             jnp.where(now.nu > 0.0, high, low),
         )
-        info = {
-            "predicted_states": jnp.tile(xi, (HORIZON, 1)),
-            "effective_samples": jnp.ones(()),
-            "healthy": jnp.asarray(True),
-        }
+        plan = PlanInfo(
+            effective_samples=jnp.ones(()), states=jnp.tile(xi, (HORIZON, 1))
+        )
+        info = ControllerInfo(plan=plan)
         return jnp.clip(jnp.stack(asked)[now.kind], low, high), memory, info
 
     return Controller(lambda key: (), act)
@@ -209,10 +209,12 @@ def part_of_run(car, make, runs, carry):
             "turned": wrap_angle(state[2] - yaw),
             "along": foot,
             "state": state,
-            "healthy": info["healthy"] & info.get("shield_healthy", True),
+            "healthy": info.healthy,
         }
-        of_guard = {"corridor", "innovation_alarm"} & info.keys()
-        recorded |= {name: info[name] for name in of_guard}
+        if info.shield is not None:
+            recorded["healthy"] &= info.claim.holds
+            recorded["bound"] = info.claim.bound
+            recorded["alarm"] = info.gate.alarm
         return (number + 1, after, foot, memory, past), recorded
 
     return jax.lax.scan(step, carry, runs.now)
@@ -351,9 +353,9 @@ def claimed(made, corridor):
         "largest_m": shown(far.max()),
     }
     # Without a guard nothing is claimed.
-    if "corridor" not in made:
+    if "bound" not in made:
         return whole
-    claims = made["corridor"]
+    claims = made["bound"]
     return whole | {
         "steps": far.size,
         "outside": int((far > corridor).sum()),
@@ -563,7 +565,7 @@ def detection_rows(car, most):
     under_law = runs.now._replace(steering=change.astype(REAL))
     in_the_class = under_law._replace(nu=nu)
     for way, now in (("law", under_law), ("class", in_the_class)):
-        alarm = car.guarded(runs._replace(now=now))["innovation_alarm"]
+        alarm = car.guarded(runs._replace(now=now))["alarm"]
         found = alarm[:, ONSET + 1 :]
         late = PERIOD * (np.argmax(found, axis=1) + 1.0)
         late = np.where(found.any(axis=1), late, np.inf)

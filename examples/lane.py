@@ -11,7 +11,6 @@ drive is written.
 
 import argparse
 import json
-from operator import itemgetter
 from pathlib import Path
 
 import jax
@@ -28,9 +27,9 @@ ROAD = {
     "wavelengths": (100.0, 300.0),  # of the bends [m]
 }
 RECORDED = {
-    "inside": itemgetter("shield_healthy"),
-    "reference": itemgetter("reference"),
-    "corridor": itemgetter("corridor"),
+    "inside": lambda info: info.claim.holds,
+    "reference": lambda info: info.lane.reference,
+    "corridor": lambda info: info.claim.bound,
 }
 """Signals of every control step that the film and the summary need."""
 OBSTACLES_OF_THE_FILM = [

@@ -16,14 +16,15 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
-CORE = {"types", "geometry", "rollout", "ranges", "paths", "lanes"}
+CORE = {"info", "types", "geometry", "rollout", "ranges", "paths", "lanes"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
 PLANT = CORE | {"plants", "scenarios"}
 PARTS = PLANT | {"control", "data"}
 ARROWS = {
-    "types": set(),
+    "info": set(),
+    "types": {"info"},
     "ranges": set(),
     "geometry": {"types"},
     "rollout": {"types", "geometry"},
@@ -44,7 +45,7 @@ ARROWS = {
     "export": CORE | {"build", "policy", "settings", "store"},
     "adapters": PLANT | {"build"},
     "report": {"build", "evaluation", "plants", "store"},
-    "__init__": {"export", "geometry", "policy", "store"},
+    "__init__": {"export", "geometry", "info", "policy", "store"},
 }
 ARROWS |= {"experiment": set(ARROWS)}
 ARROWS |= {name: set(ARROWS) for name in COMMANDS}

@@ -11,6 +11,7 @@ from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 
 from sfkd_jax import build, data, evaluation, models, plants, policy
+from sfkd_jax.info import ControllerInfo
 from sfkd_jax.plants import StateVariable
 from sfkd_jax.report.run import write_report
 from sfkd_jax.settings import schema
@@ -57,11 +58,11 @@ def registered(monkeypatch):
 def test_it_is_simulated_through_the_sensor_that_it_states(registered):
     plant = build.build_vehicle(registered)
     follow = driver(plant)
-    seen = {"charge": lambda info: info["seen"]}
+    seen = {"charge": lambda info: info.planner}
 
     def act(params, memory, observation, env, reference):
-        told = {"effective_samples": 1.0, "healthy": True, "seen": observation[7]}
-        return follow(observation, reference), memory, told
+        info = ControllerInfo(planner=observation[7])
+        return follow(observation, reference), memory, info
 
     scenario = build.build_scenario({"name": "s1"}, plant, duration=3.0)
     episode = evaluation.simulate(
@@ -151,7 +152,7 @@ def test_adaptation_refuses_what_nobody_knows_of_it_and_works_when_told():
     inputs = jnp.zeros(8), jnp.asarray([0.7, 0.0]), jnp.zeros((3, 4))
     action, _, info = jax.eval_shape(controller.act, {}, state, *inputs)
     assert action.shape == (2,)
-    assert info["predicted_states"].shape[-1] == 8
+    assert info.plan.states.shape[-1] == 8
 
 
 def test_adaptation_refuses_an_exact_sensor():

@@ -15,6 +15,7 @@ from helpers import driver
 
 import sfkd_jax
 from sfkd_jax import plants
+from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.types import Controller
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -159,7 +160,7 @@ def node(monkeypatch):
     def act(params, memory, observation, env, reference):
         seen = jnp.all(jnp.isfinite(observation))
         control = jnp.where(seen, law(observation, reference), 0.0)
-        return control, memory, {"healthy": seen}
+        return control, memory, ControllerInfo(plan=PlanInfo(healthy=seen))
 
     policy = SimpleNamespace(
         params={},

@@ -151,7 +151,8 @@ def in_process(loaded):
     observations, envs, reference = measurements()
     for observation, env in zip(observations, envs, strict=True):
         control, state, info = act(loaded.params, state, observation, env, reference)
-        steps.append(plain((control, state, info)))
+        parts = {"healthy": info.healthy, **info._asdict()}
+        steps.append(plain((control, state, parts)))
     return steps
 
 
@@ -165,13 +166,17 @@ def repeated(folder, observations, envs, **ahead):
             sys.modules[name] = None  # an import of it fails
         import numpy as np
         from run_controller import ExportedController
+        def leaves_of(node):
+            if not hasattr(node, "__dict__") or hasattr(node, "shape"):
+                return [node]
+            return [leaf for part in vars(node).values() for leaf in leaves_of(part)]
         controller = ExportedController()
         state, arrays = controller.init(seed=7), {{}}
         with np.load("measured.npz") as given:
             for k, (observation, env) in enumerate(zip(given["observations"], given["envs"])):
                 ahead = {{name[6:]: given[name][k] for name in given.files if name[:6] == "ahead/"}}
                 control, state, info = controller.act(state, observation, env, ahead)
-                leaves = [control, *state.values(), *info.values()]
+                leaves = [control, *state.values(), *leaves_of(info)]
                 arrays |= {{f"{{k}}/{{i}}": np.asarray(leaf) for i, leaf in enumerate(leaves)}}
         np.savez("steps.npz", **arrays)
         packages = {{name.split(".")[0] for name, module in sys.modules.items() if module is not None}}
@@ -260,8 +265,8 @@ def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
         same = {"rtol": 0.0, "atol": 0.0 if k < 4 else 1e-4}
         np.testing.assert_allclose(step["control"], control, **same)
         # After the stop for what was not finite nothing is claimed for a while.
-        assert step["info.healthy"] == info["healthy"] == (k < 2)
-    assert steps[3]["info.stopping"]
+        assert step["info.healthy"] == info.healthy == (k < 2)
+    assert steps[3]["info.lane.stopping"]
     ahead = steps[4]["state.progress"] - state.progress
     np.testing.assert_allclose(ahead, -4.0, atol=1e-4)
     with pytest.raises(ValueError, match=r"export.lane must be \[points"):
@@ -400,10 +405,10 @@ def test_arguments_of_the_wrong_shape_are_named(exported):
     near, _, _ = controller.act(state, home[0], envs[0], home[1])
     away, _, info = controller.act(state, there[0], envs[0], there[1], elapsed=1)
     np.testing.assert_array_equal(away, near)
-    assert info["healthy"]
-    assert np.abs(info["predicted_states"][:, :2] - far).max() < 100.0
+    assert info.healthy
+    assert np.abs(info.plan.states[:, :2] - far).max() < 100.0
     rounded = [one.astype(np.float32) for one in there]
-    assert not controller.act(state, rounded[0], envs[0], rounded[1])[2]["healthy"]
+    assert not controller.act(state, rounded[0], envs[0], rounded[1])[2].healthy
     (elapsed,) = (name for name in state if name.endswith("tuning.elapsed"))
     late = state | {elapsed: np.float32(2.5)}
     for one, options in ((state, {"elapsed": 2.5}), (late, {})):

@@ -34,7 +34,7 @@ def test_a_shipped_policy_is_certified_and_acts_as_recorded(name, recorded):
         acted = []
         for inputs in zip(states, envs, references, strict=True):
             control, memory, info = act(policy.params, memory, *inputs)
-            assert bool(info["healthy"])
+            assert bool(info.healthy)
             acted.append(np.asarray(control))
         assert act._cache_size() == 1  # states keep their types
         # Rounding differs between processors and compilers, and grows with the plan.

@@ -31,7 +31,7 @@ state, env = jnp.array([0.0, 0.3, 0.0, 10.0]), jnp.array([0.6, 0.0])
 control, _, info = jax.jit(policy.controller.act)(
     policy.params, memory, state, env, reference
 )
-assert bool(info["healthy"]), info
+assert bool(info.healthy), info
 def run(name):
     return lambda: runpy.run_module(f"sfkd_jax.{name}", run_name="__main__")
 for start in map(run, ("train", "report", "export")):

@@ -14,6 +14,7 @@ from helpers import same, straight
 
 import sfkd_jax
 from sfkd_jax import control, policy
+from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.types import Controller
 
 KEY, ENV = jax.random.key(0), jnp.asarray([0.7, 0.0])
@@ -35,13 +36,13 @@ def test_shipped_policies_also_work_with_an_estimated_environment():
     other, after, _ = act(*known, jnp.asarray([0.3, 8.0]), straight(20))
     np.testing.assert_array_equal(control_1, other)
     # Nothing has moved yet.
-    np.testing.assert_allclose(info["env_estimate"], [0.6, 0.0], atol=1e-4)
+    np.testing.assert_allclose(info.adaptation.env, [0.6, 0.0], atol=1e-4)
     tuned = control.tuned(after, noise_std=[1e-6, 1e-6], elapsed=2)
     assert type(tuned) is type(after)
     _, later, quiet = act(trained.params, tuned, known[2], ENV, straight(20))
     assert act._cache_size() == 1
     # All samples are the plan itself, but that of the law alone.
-    np.testing.assert_allclose(quiet["cost"], quiet["mean_cost"], rtol=1e-2)
+    np.testing.assert_allclose(quiet.plan.cost, quiet.plan.mean_cost, rtol=1e-2)
     with pytest.raises(ValueError, match="unknown entry of tuning temprature"):
         control.tuned(later, temprature=1.0)
     with pytest.raises(ValueError, match="holds no state of a planner"):
@@ -156,9 +157,9 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
     lateral, info = drive(controls)
     worst = np.max(np.abs(lateral), axis=1)
     assert np.all(worst <= trained.certificate["corridor"]["corridor_m"]), worst
-    assert not np.any(info["healthy"][0])
+    assert not np.any(info.healthy[0])
     assert np.all(worst[2:4] > 0.02)  # as far as the filter lets them
-    assert info["mine"].shape == lateral.shape
+    assert info.planner["mine"].shape == lateral.shape
 
 
 def test_what_planners_add_to_the_model_reaches_no_guard():
@@ -172,10 +173,10 @@ def test_what_planners_add_to_the_model_reaches_no_guard():
         params = trained.params._replace(weights={**weights, "planning": more})
         told.append(guard(params, guarded.init(KEY), x, ENV, straight(20)))
         u, _, info = act(params, memory, x, ENV, straight(20))
-        assert bool(info["shield_healthy"])
-        assert float(info["margin"]) > 0.0
+        assert bool(info.claim.holds)
+        assert float(info.shield.margin) > 0.0
         if not size < 1e30:
-            assert not bool(info["healthy"])
+            assert not bool(info.healthy)
             xi, road = jnp.asarray([0.05, 0.0, 10.0]), jnp.asarray([0.0, 10.0])
             np.testing.assert_allclose(u, trained.law(xi, *road, ENV), atol=1e-5)
     assert all(same(one, told[0], rtol=0, atol=0) for one in told[1:])
@@ -194,7 +195,7 @@ def test_a_planner_in_a_guard_sees_what_the_gate_believes():
         road = straight(20).at[:, 0].add(x[0])
         u, state, info = act(trained.params, state, told, ENV, road)
         most = np.asarray([0.1, 0.1, 0.1, 0.15]) * (k in faults)
-        np.testing.assert_array_less(np.abs(info["seen"] - x), most + 1e-6)
+        np.testing.assert_array_less(np.abs(info.planner["seen"] - x), most + 1e-6)
         x = trained.vehicle.step(x, u, ENV)
 
 
@@ -208,7 +209,7 @@ def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
         jax.eval_shape(wide.act, trained.params, wide.init(KEY), *inputs)
     _, state, info = jax.eval_shape(own.act, trained.params, own.init(KEY), *inputs)
     assert jax.tree.structure(state) == jax.tree.structure(own.init(KEY))
-    assert info["predicted_states"].shape == (20, 4)
+    assert info.plan.states.shape == (20, 4)
     lawful = control.requesting(scripted(jnp.zeros((1, 2))), 20, 3)
     along = trained.guard(lawful, along_path=True)
     jax.eval_shape(along.act, trained.params, along.init(KEY), *inputs)
@@ -236,8 +237,9 @@ def test_a_policy_drives_on_earth_as_it_does_at_the_origin(vehicle):
             u, state, info = act(trained.params, state, seen, ENV, ahead)
             x = step(x, u, ENV)
             errors.append(float(x[1]))
-        assert bool(info["precision"]) == bool(info["healthy"])
-        return np.sqrt(np.mean(np.square(errors))), bool(info["precision"])
+        precise = Reason(int(info.claim.reason)) != Reason.IMPRECISE
+        assert precise == bool(info.healthy)
+        return np.sqrt(np.mean(np.square(errors))), precise
 
     home, _ = drive(np.zeros(2), 0.0, sfkd_jax.relative)
     utm = np.asarray([500000.13, 4500000.23])
@@ -251,7 +253,7 @@ def test_positions_are_relative_before_the_cast_and_reported_in_the_world():
     trained = load("kinematic_path")
 
     def act(params, state, observation, env, reference):
-        info = {"predicted_states": jnp.tile(observation, (2, 1))}
+        info = ControllerInfo(plan=PlanInfo(states=jnp.tile(observation, (2, 1))))
         return reference[0, :2] - observation[:2], state, info
 
     echo = policy._entrance(Controller(lambda key: key, act), trained)
@@ -260,11 +262,11 @@ def test_positions_are_relative_before_the_cast_and_reported_in_the_world():
     expected = near[0, :2] - near[1, :2]
     ahead, _, info = echo.act({}, (), far[1], ENV, far)
     np.testing.assert_allclose(ahead, expected, atol=1e-4)
-    np.testing.assert_allclose(info["predicted_states"][0], far[1], atol=1e-4)
+    np.testing.assert_allclose(info.plan.states[0], far[1], atol=1e-4)
     with jax.enable_x64(True):
         ahead, _, info = jax.jit(echo.act)({}, (), far[1], ENV, far)
         np.testing.assert_allclose(ahead, expected, atol=1e-4)
-        np.testing.assert_allclose(info["predicted_states"][0], far[1], atol=1e-4)
+        np.testing.assert_allclose(info.plan.states[0], far[1], atol=1e-4)
     # A reference that is not finite moves nothing; near the origin nothing changes.
     assert not sfkd_jax.relative(far[1], np.nan * far)[2].any()
     kept = sfkd_jax.relative(near[1], near)

@@ -120,7 +120,7 @@ class ControllerNode(Node):
         control, self.memory, info = self.act(
             self.policy.params, self.memory, observation, self.env, reference
         )
-        self.blind = 0 if bool(info["healthy"]) else self.blind + 1
+        self.blind = 0 if bool(info.healthy) else self.blind + 1
         if self.blind > self.setting("patience"):
             control = jnp.asarray([control[0], BRAKING])
         self.publish(control)

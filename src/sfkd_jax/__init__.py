@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sfkd_jax.export import warm_up as warm_up
     from sfkd_jax.geometry import relative as relative
+    from sfkd_jax.info import Reason as Reason
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
     from sfkd_jax.policy import policies as policies
@@ -20,6 +21,7 @@ _LAZY = {
     "relative": "geometry",
     "warm_up": "export",
     "ArtefactError": "store",
+    "Reason": "info",
 }
 
 

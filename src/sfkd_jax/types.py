@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Required, TypeAlias, TypedDict
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sfkd_jax.info import ControllerInfo
 
 Key: TypeAlias = PRNGKeyArray
 State: TypeAlias = Float[Array, " state"]
@@ -226,64 +228,6 @@ class Model(NamedTuple):
     structure: Structure = Structure()
     along_path: bool = False
     planning: Model | None = None
-
-
-class ControllerInfo(TypedDict, total=False):
-    """Diagnostics of a control step.
-
-    Every planner gives the first six entries. The others are added by what is named
-    above them, if it is there.
-    """
-
-    cost: Required[Scalar]  # lowest cost of all samples
-    mean_cost: Required[Scalar]  # cost of the chosen plan
-    effective_samples: Required[Scalar]  # 1 / Σ w²; NaN if nothing is sampled
-    healthy: Required[Bool[Array, ""]]  # a working planner gave this control
-    env_inside: Required[Bool[Array, ""]]  # whether e is in its box
-    predicted_states: Required[Float[Array, "horizon state"]]  # of the chosen plan
-    precision: Bool[Array, ""]  # whether float32 resolves the positions
-    # Planners of a constrained task:
-    violation: Scalar  # largest one of a constraint along the chosen plan, or 0
-    constraints_kept: Bool[Array, ""]  # whether the violation is 0
-    # `control.along_reference`:
-    path_state: Float[Array, " coordinate"]  # ξ; NaN where it is not known
-    road: Float[Array, " 2"]  # κ [1/m] and v_ref [m/s] of this step
-    planned_path: Float[Array, "horizon coordinate"]  # predicted ξ of the chosen plan
-    # `control.Gate`:
-    measured: Bool[Array, " coordinate"]  # which of ξ is measured, not predicted
-    dead_reckoning: Bool[Array, ""]  # whether a part of ξ is predicted
-    innovation: Float[Array, " coordinate"]  # measured less predicted ξ
-    innovation_statistic: Scalar  # of the test, above 1 an alarm; NaN without a test
-    innovation_alarm: Bool[Array, ""]  # not the vehicle or sensors of the calibration
-    trusted: Bool[Array, ""]  # on time, no alarm, no unexplained measurement of late
-    # `control.Adaptation`:
-    env_estimate: Float[Array, " environment"]  # the e that the planner reads
-    causes: Float[Array, " 5"]  # force, steering, drive; steering and force in turns
-    causes_std: Float[Array, " 5"]  # standard deviations of the estimates
-    rejected: Bool[Array, ""]  # nothing was learned from the measurement
-    adapting: Bool[Array, ""]  # the causes do not predict worse than none
-    # `control.Shield`:
-    margin: Scalar  # distance of the nominal model to the edge of its corridor [m]
-    intervention: Scalar  # share of the request that was removed, in [0, 1]
-    perturbation: Float[Array, " control"]  # ν on top of the law, in control units
-    nominal_state: Float[Array, " coordinate"]  # path coordinates of the nominal model
-    nominal_distance: Scalar  # |e_y| between vehicle and nominal model [m]
-    corridor: Scalar  # bound of |e_y| at this step [m]; NaN where none holds
-    feasible: Bool[Array, ""]  # margin is not negative
-    bound_exceeded: Bool[Array, ""]  # nominal_distance exceeds the certified bound
-    outside_box: Bool[Array, ""]  # outside the boxes of the certificate
-    braking: Bool[Array, ""]  # the planner brakes beyond the class
-    rolling: Scalar  # part of the corridor from below its slowest speed [m]
-    shield_healthy: Bool[Array, ""]  # there is a corridor
-    # `control.InLane`:
-    reference: Reference  # the window that is followed
-    offset: Scalar  # of the reference from the centre line [m]
-    admissible: Bool[Array, ""]  # the committed reference is in its class, and free
-    stopping: Bool[Array, ""]  # it ends at rest
-    evading: Bool[Array, ""]  # it is outside the class
-    # A course with obstacles:
-    clearance: Scalar  # claimed distance from obstacles [m]; NaN where none is
-    gap: Scalar  # their true distance, as a simulation knows it [m]
 
 
 class Controller(NamedTuple):

@@ -14,6 +14,7 @@ from brax.envs.wrappers.training import EvalWrapper, wrap
 from helpers import at, jit, same
 
 from sfkd_jax import adapters, build, control, evaluation, geometry, plants
+from sfkd_jax.info import ControllerInfo
 from sfkd_jax.types import Controller
 
 STEPS = 25
@@ -66,8 +67,7 @@ def test_a_controller_drives_it_as_the_test_track_has_it_driven():
     plant, law = plants.kinematic(), build.build_driver(plants.kinematic())
 
     def act(params, state, observation, env, reference):
-        info = {"effective_samples": jnp.ones(()), "healthy": jnp.asarray(True)}
-        return law(observation, reference), state, info
+        return law(observation, reference), state, ControllerInfo()
 
     start = compiled()[0](jax.random.key(0))
     controller, given = Controller(lambda key: (), act), {"dt": plant.dt, "horizon": 10}

@@ -13,6 +13,7 @@ from sfkd_jax.certification._weights import exported
 from sfkd_jax.control.wrappers import _estimator as estimator
 from sfkd_jax.control.wrappers._adaptation import _compensation
 from sfkd_jax.geometry import path_state
+from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
@@ -38,7 +39,7 @@ def law_alone():
 
     def act(params, state, xi, env, preview):
         ahead = jnp.tile(xi, (HORIZON, 1))
-        info = {"healthy": jnp.asarray(True), "predicted_states": ahead, "seen": xi}
+        info = ControllerInfo(plan=PlanInfo(states=ahead), planner=xi)
         return LAW(xi, *preview.road[0], env), state, info
 
     return Controller(lambda key: jnp.zeros(()), act)
@@ -155,17 +156,17 @@ def test_the_certificate_of_the_model_holds_for_the_adapted_one():
 def test_a_constant_side_force_is_found():
     force = -0.6
     info, _ = drive(force=force, shrinkage=0.0)
-    causes = info["causes"][-20:]
+    causes = info.adaptation.causes[-20:]
     np.testing.assert_allclose(causes[:, estimator.FORCE], force, atol=0.05)
     np.testing.assert_allclose(causes[:, estimator.STEERING], 0.0, atol=0.002)
 
 
 def test_a_wrong_steering_angle_is_found_and_removed():
     info, _ = drive(steering=0.02)
-    causes = info["causes"][-20:]
+    causes = info.adaptation.causes[-20:]
     np.testing.assert_allclose(causes[:, estimator.STEERING], 0.02, atol=1e-3)
-    assert np.all(info["adapting"][20:])
-    assert np.abs(info["seen"][-20:, 0]).max() < 0.01
+    assert np.all(info.adaptation.adapting[20:])
+    assert np.abs(info.planner[-20:, 0]).max() < 0.01
 
 
 def test_the_true_cause_lies_within_the_reported_spread():
@@ -175,15 +176,15 @@ def test_the_true_cause_lies_within_the_reported_spread():
     for seed in range(3):
         settings = {"force": truth[0], "steering": truth[1], "noise": 1.0}
         info, _ = drive(seed, shrinkage=0.0, **settings)
-        gap = np.abs(info["causes"][30:, :2] - truth)
-        inside.append(gap <= 3.0 * info["causes_std"][30:, :2] + 1e-3)
+        gap = np.abs(info.adaptation.causes[30:, :2] - truth)
+        inside.append(gap <= 3.0 * info.adaptation.causes_std[30:, :2] + 1e-3)
     assert np.mean(inside) > 0.95
 
 
 def test_wind_is_estimated_if_it_is_not_measured():
     """A force of 0.5 is a wind of √0.5 of the largest; e is not read."""
     info, _ = drive(force=0.5, estimate_env=True)
-    wind = info["env_estimate"][-20:, 1]
+    wind = info.adaptation.env[-20:, 1]
     np.testing.assert_allclose(wind, np.sqrt(0.5) * ENV_HIGH[1], atol=0.8)
 
 
@@ -192,9 +193,9 @@ def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
     """At the fault the causes move by less than a tenth of what was learned."""
     settings = {"force": 0.5, "steering": 0.01, "noise": 1.0, "shrinkage": 0.0}
     info, belief = drive(fault=fault, **settings)
-    assert info["rejected"][60]
-    change = np.abs(np.diff(info["causes"][58:66, :2], axis=0)).max(axis=0)
-    usual = np.abs(np.diff(info["causes"][30:58, :2], axis=0)).max(axis=0)
+    assert info.adaptation.rejected[60]
+    change = np.abs(np.diff(info.adaptation.causes[58:66, :2], axis=0)).max(axis=0)
+    usual = np.abs(np.diff(info.adaptation.causes[30:58, :2], axis=0)).max(axis=0)
     assert np.all(change <= np.maximum(2.0 * usual, [0.05, 0.001]))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
 
@@ -202,7 +203,7 @@ def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
 def test_hostile_measurements_leave_finite_bounded_estimates():
     info, belief = drive(fault="hostile", force=0.5, noise=1.0)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(belief.bank))
-    assert np.all(np.abs(info["causes"]) <= estimator.BOUNDS)
+    assert np.all(np.abs(info.adaptation.causes) <= estimator.BOUNDS)
     diagonals = np.diagonal(belief.bank.covariances, axis1=-2, axis2=-1)
     assert diagonals.min() >= 0.0
     np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
@@ -226,8 +227,8 @@ def test_causes_that_predict_worse_than_none_are_not_used():
     gate = gate._replace(inner=gate.inner._replace(belief=belief))
     state = state._replace(inner=gate)
     _, _, info = act({}, state, *INPUTS)
-    assert not info["adapting"]
-    np.testing.assert_array_equal(info["causes"], 0.0)
+    assert not info.adaptation.adapting
+    np.testing.assert_array_equal(info.adaptation.causes, 0.0)
 
 
 def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():

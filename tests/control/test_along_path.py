@@ -59,7 +59,7 @@ def test_without_samples_the_law_alone_drives():
     state = jnp.asarray([30.0, 0.4, 0.1, 8.0])
     action, _, info = act({}, memory, state, ENV, reference)
     np.testing.assert_allclose(action, law_at(state, reference), atol=1e-6)
-    assert bool(info["healthy"])
+    assert bool(info.healthy)
 
 
 def test_what_is_added_to_the_law_stays_within_its_bounds():
@@ -84,8 +84,8 @@ def test_predicted_states_lie_where_the_car_then_is():
     memory, act = planner(1)
     action, _, info = act({}, memory, point, ENV, reference)
     after = PLANT.step(point, action, ENV)
-    np.testing.assert_allclose(info["predicted_states"][0, :2], after[:2], atol=0.05)
-    np.testing.assert_allclose(info["predicted_states"][0, 2:], after[2:], atol=0.01)
+    np.testing.assert_allclose(info.plan.states[0, :2], after[:2], atol=0.05)
+    np.testing.assert_allclose(info.plan.states[0, 2:], after[2:], atol=0.01)
 
 
 def test_a_model_of_the_world_is_refused():

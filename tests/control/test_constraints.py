@@ -38,7 +38,7 @@ def drive(controller, start, steps=25):
         x, state = carry
         u, state, info = controller.act({}, state, x, NOTHING, ())
         x = x + 0.25 * u
-        return (x, state), (x, info["violation"], info["constraints_kept"])
+        return (x, state), (x, info.plan.violation, (info.plan.violation <= 0.0))
 
     first = (start, controller.init(jax.random.key(0)))
     return jax.lax.scan(step, first, length=steps)[1]
@@ -63,8 +63,8 @@ def test_the_mean_of_passing_on_both_sides_is_not_driven():
     _, state, info = jit(controller.act)(
         {}, state, jnp.asarray([0.3, 0.0]), NOTHING, ()
     )
-    assert info["constraints_kept"]
-    clearance = jnp.linalg.norm(info["predicted_states"] - CIRCLE[0, :2], axis=1)
+    assert info.plan.violation <= 0.0
+    clearance = jnp.linalg.norm(info.plan.states - CIRCLE[0, :2], axis=1)
     assert clearance.min() >= 0.4
 
 
@@ -96,7 +96,7 @@ def test_a_violation_that_is_not_a_number_is_not_kept():
     controller = point_mass(lambda data, x, u, target, at: jnp.full(1, jnp.nan), ())
     state = controller.init(jax.random.key(0))
     u, _, info = jit(controller.act)({}, state, GOAL, NOTHING, ())
-    assert not info["constraints_kept"]
+    assert not (info.plan.violation <= 0.0)
     assert jnp.all(jnp.isfinite(u))
 
 

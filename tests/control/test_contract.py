@@ -4,7 +4,7 @@ wrappers. `test_mppi.py` asserts more for `mppi` alone.
 
 from functools import cache, partial
 from inspect import signature
-from typing import Required, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,19 @@ from helpers import (
 from jaxtyping import jaxtyped
 
 from sfkd_jax import build, control, models, plants
+from sfkd_jax.info import (
+    AdaptationInfo,
+    Claim,
+    ControllerInfo,
+    GateInfo,
+    LaneInfo,
+    PathInfo,
+    PlanInfo,
+    Reason,
+    ShieldInfo,
+    first,
+)
 from sfkd_jax.rollout import fold, with_offset
-from sfkd_jax.types import ControllerInfo
 
 PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -251,19 +262,19 @@ def test_controls_are_finite_and_within_the_limits_whatever_is_seen(name):
     low, high = np.float32(PLANT.control_low), np.float32(PLANT.control_high)
     assert np.all(np.isfinite(controls))
     assert np.all((low <= controls) & (controls <= high))
-    assert info["predicted_states"].shape == (10, HORIZON, 4)
+    assert info.plan.states.shape == (10, HORIZON, 4)
 
 
 @every
 def test_an_input_that_is_not_finite_is_reported_and_the_next_clean_step_recovers(name):
     _, info = drive(name)
-    healthy = np.asarray(info["healthy"])[:9]
+    healthy = np.asarray(info.healthy)[:9]
     unhealthy, blackouts = set(np.flatnonzero(~healthy)), set(BLACKOUTS.values())
     # A filter that steers the car back does not drive the plan either, and a gate does
     # not believe observations that its model does not expect.
     gated = name in ("shielded", "adaptive")
     assert unhealthy >= blackouts if gated else unhealthy == blackouts
-    assert np.all(np.isfinite(np.asarray(info["predicted_states"])[:9][healthy]))
+    assert np.all(np.isfinite(np.asarray(info.plan.states)[:9][healthy]))
 
 
 @pytest.mark.parametrize("name", PLANNERS | WRAPPERS)
@@ -313,39 +324,69 @@ def test_it_is_traced_once_while_state_observation_environment_reference_and_key
 @every_sampling
 def test_another_key_makes_another_plan(name):
     first, other = (act_once(name, seed) for seed in (1, 2))
-    for entry in ("cost", "predicted_states"):
-        assert not np.array_equal(first[2][entry], other[2][entry])
+    for entry in ("cost", "states"):
+        plans = [getattr(step[2].plan, entry) for step in (first, other)]
+        assert not np.array_equal(*plans)
     if name != "shielded":  # its control may be the law's, whatever the plan is
         assert not np.array_equal(first[0], other[0])
 
 
-DOCUMENTED = get_type_hints(ControllerInfo)
-REQUIRED = {
-    key
-    for key, hint in get_type_hints(ControllerInfo, include_extras=True).items()
-    if get_origin(hint) is Required
+PARTS = {
+    "plan": PlanInfo,
+    "claim": Claim,
+    "path": PathInfo,
+    "gate": GateInfo,
+    "adaptation": AdaptationInfo,
+    "shield": ShieldInfo,
+    "lane": LaneInfo,
 }
 
 
 @jaxtyped(typechecker=None)
 def undocumented(info):
-    """The entries of an info that `ControllerInfo` does not document with their shape."""
+    """Entries of a part of an info whose shapes are not the documented ones."""
     return {
-        key: value.shape
-        for key, value in info.items()
-        if key not in DOCUMENTED or not isinstance(value, DOCUMENTED[key])
+        (name, entry): np.shape(value)
+        for name, part in PARTS.items()
+        if (values := getattr(info, name)) is not None
+        for entry, value in values._asdict().items()
+        if (hint := get_type_hints(part)[entry]) is not Any
+        and not isinstance(value, hint | None)
     }
 
 
 @every
 def test_info_has_the_documented_entries_with_the_documented_shapes(name):
     _, _, info = act_once(name)
+    assert isinstance(info, ControllerInfo)
     assert undocumented(info) == {}
-    assert set(info) >= REQUIRED
+    assert Reason(int(info.claim.reason)) in Reason
 
 
-def test_every_documented_entry_is_given_by_a_planner_or_a_wrapper():
-    given = [act_once(name)[2] for name in BUILDERS]
-    # Of `InLane`, in test_lanes.py; the gap is of a course with obstacles.
-    lane = {"reference", "offset", "admissible", "stopping", "evading", "clearance"}
-    assert lane.union({"gap"}, *given) == set(DOCUMENTED)
+def test_every_part_is_given_by_a_planner_or_a_wrapper():
+    given = set()
+    for name in BUILDERS:
+        info = act_once(name)[2]
+        given |= {part for part in PARTS if getattr(info, part) is not None}
+    assert given == set(PARTS) - {"lane"}  # of `InLane`, see test_lanes.py
+
+
+def test_every_reason_has_advice_and_the_first_one_is_reported():
+    assert all(reason.advice.endswith(".") for reason in Reason)
+    late, wild = jnp.asarray(True), jnp.asarray(False)
+    reason = first(Reason.CERTIFIED, (wild, Reason.ALARM), (late, Reason.TRIAL))
+    assert int(reason) == Reason.TRIAL
+    assert int(first(reason, (late, Reason.ALARM))) == Reason.TRIAL
+    claim = Claim(bound=jnp.asarray(0.1), reason=jnp.asarray(Reason.CERTIFIED))
+    assert bool(claim.holds)
+    assert not bool(claim.under(reason).holds)
+    assert int(claim.under(reason).reason) == Reason.TRIAL
+    assert int(claim.unless(wild, Reason.EVADING).reason) == Reason.CERTIFIED
+
+
+@pytest.mark.parametrize("reason", Reason)
+def test_a_controller_is_healthy_where_nothing_speaks_against_its_plan(reason):
+    usual = (Reason.CERTIFIED, Reason.NO_CERTIFICATE, Reason.NOT_CALIBRATED)
+    info = ControllerInfo(claim=Claim(reason=jnp.asarray(reason)))
+    assert bool(info.healthy) == (reason in usual)
+    assert not bool(info._replace(plan=PlanInfo(healthy=jnp.asarray(False))).healthy)

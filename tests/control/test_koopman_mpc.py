@@ -78,8 +78,8 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted():
             tracking.weights, StageInputs(later, errors, now, before, BEND[k, 3])
         )
         total, errors, before = total + (1 + (k == HORIZON - 1)) * cost, later, now
-    np.testing.assert_allclose(info["cost"], total, rtol=2e-3)
-    assert np.isnan(info["effective_samples"])
+    np.testing.assert_allclose(info.plan.cost, total, rtol=2e-3)
+    assert np.isnan(info.plan.effective_samples)
 
 
 @cache
@@ -95,7 +95,7 @@ def drive(curvature, offset):
         compiled()[0],
         dt=0.1,
         horizon=HORIZON,
-        record={"expected": lambda info: info["predicted_states"][0, :2]},
+        record={"expected": lambda info: info.plan.states[0, :2]},
     )
     return jit(run)(koopman()[1], road, jax.random.key(0))
 

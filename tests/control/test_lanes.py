@@ -13,6 +13,7 @@ import sfkd_jax
 from sfkd_jax import control
 from sfkd_jax.control.lanes._judging import Situation
 from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
+from sfkd_jax.info import Claim, ControllerInfo, Reason
 from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
 from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic
 from sfkd_jax.types import Controller
@@ -129,7 +130,8 @@ def follower():
     """A controller that reports the window it is given, and a certain corridor."""
 
     def act(params, state, observation, env, reference):
-        info = {"healthy": jnp.asarray(True), "corridor": jnp.asarray(KIND.corridor)}
+        claim = Claim(bound=jnp.asarray(KIND.corridor), reason=Reason.CERTIFIED)
+        info = ControllerInfo(claim=claim)
         return jnp.zeros(2), state, info
 
     return Controller(lambda key: jnp.zeros(()), act)
@@ -161,7 +163,7 @@ def drive(lane, road, seen, steps, *, speed=10.0, friction=0.9):
         scene = (road, seen(number, car))
         _, state, info = act(None, state, car, jnp.asarray([friction, 0.0]), scene)
         rows.append((car, state, jax.tree.map(np.asarray, info)))
-        car = rows[-1][2]["reference"][0]
+        car = rows[-1][2].lane.reference[0]
     return rows
 
 
@@ -193,10 +195,10 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, pl
         return posts._replace(present=jnp.asarray(near))
 
     rows = drive(lane, road, seen, 180)
-    assert all(bool(info["admissible"]) for _, _, info in rows)
+    assert all(bool(info.lane.admissible) for _, _, info in rows)
     cars = np.stack([car for car, _, _ in rows]).astype(np.float64)
     rooms = [room(car, posts) for car in cars]
-    claims = np.array([info["clearance"] for _, _, info in rows])
+    claims = np.array([info.lane.clearance for _, _, info in rows])
     assert min(rooms) > KIND.margin
     # What is claimed is about a car anywhere in the corridor.
     visible = [room(car, seen(0, car)) for car in cars]
@@ -234,14 +236,14 @@ def test_where_nothing_is_admissible_it_stops_and_goes_on_later(lane, road, wall
     rows = drive(lane, road, seen, 200, friction=0.6)
     for number, (car, _, info) in enumerate(rows[:150]):
         assert room(car, wall) > 0.5
-        assert bool(info["stopping"]) or number == 0
+        assert bool(info.lane.stopping) or number == 0
         stood.append(car[3])
     assert stood[-1] == 0.0
     near, far = (0.7, 2.5) if one else (12.0, 40.0)
     assert near < room(rows[149][0], wall) < far
     assert np.diff(stood).min() > -0.7 * 9.81 * 0.6 * DT - 0.05
     assert rows[-1][0][3] > 1.5
-    assert not bool(rows[-1][2]["stopping"])
+    assert not bool(rows[-1][2].lane.stopping)
 
 
 def test_somebody_who_crosses_is_passed_where_he_is_then(lane, road):
@@ -259,7 +261,7 @@ def test_somebody_who_crosses_is_passed_where_he_is_then(lane, road):
     for number, (car, _, info) in enumerate(rows):
         real = room(car, seen(number, car, 1))
         assert real > KIND.margin
-        assert info["clearance"] <= real + 1e-3
+        assert info.lane.clearance <= real + 1e-3
     cars = np.stack([car for car, _, _ in rows])
     assert cars[-1, 0] > 75.0
 
@@ -292,13 +294,13 @@ def test_what_appears_too_near_to_stop_is_evaded_without_a_claim(lane, road):
 
     rows = drive(lane, road, seen, 90, friction=0.3)
     assert min(room(car, person) for car, _, _ in rows) > 0.2
-    evading = np.array([info["evading"] for _, _, info in rows])
+    evading = np.array([info.lane.evading for _, _, info in rows])
     assert 2 < evading.sum() < 30
-    claims = np.array([info["clearance"] for _, _, info in rows])
+    claims = np.array([info.lane.clearance for _, _, info in rows])
     assert np.isnan(claims[evading]).all()
     # The last reference of its own class again, and some time to follow it.
     assert not np.isnan(claims[-10:]).any()
-    assert not any(info["healthy"] for _, _, info in np.array(rows, object)[evading])
+    assert not any(info.healthy for _, _, info in np.array(rows, object)[evading])
     cars = np.stack([car for car, _, _ in rows]).astype(np.float64)
     turned = np.diff(np.unwrap(cars[:, 2])) / DT
     pull = np.hypot(turned * cars[1:, 3], np.diff(cars[:, 3]) / DT)
@@ -313,19 +315,19 @@ def test_what_is_attacked_is_not_admitted(lane, road, attack):
     rows = drive(lane, road, lambda *_: none, 4)
     act = lane[1]
     car, state, info = rows[-1]
-    assert bool(info["admissible"])
+    assert bool(info.lane.admissible)
     place = car[:2] + (np.nan if attack == "nan" else 0.0)
     posts, lane_now = circles(jnp.asarray(place)[None], 0.8), road
     if attack == "edge":
         posts, lane_now = none, road._replace(left=jnp.full(700, 0.5))
     before = state
     _, state, info = act(None, state, car, jnp.asarray([0.9, 0.0]), (lane_now, posts))
-    assert not bool(info["admissible"])
-    assert bool(info["stopping"])
-    assert bool(info["healthy"]) == (attack != "nan")
-    assert np.isnan(info["clearance"]) if attack == "nan" else True
-    assert np.all(np.isfinite(info["reference"]))
-    assert info["reference"][-1, 3] < 2.0
+    assert not bool(info.lane.admissible)
+    assert bool(info.lane.stopping)
+    assert bool(info.healthy) == (attack != "nan")
+    assert np.isnan(info.lane.clearance) if attack == "nan" else True
+    assert np.all(np.isfinite(info.lane.reference))
+    assert info.lane.reference[-1, 3] < 2.0
     # It brakes where it is, and does not swerve.
     moved = int(state.committed.index - before.committed.index)
     np.testing.assert_allclose(
@@ -373,7 +375,7 @@ def test_a_batch_of_laps_is_each_of_them_and_one_program(lane):
     _, _, info = batch(states, where)
     for one, number in enumerate((11, 301)):
         np.testing.assert_allclose(
-            info["reference"][one], rows[number][2]["reference"], atol=2e-3
+            info.lane.reference[one], rows[number][2].lane.reference, atol=2e-3
         )
 
 
@@ -389,7 +391,7 @@ def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
         return driver.act(policy.params, start, at, jnp.zeros(2), scene)[2]
 
     info = jax.eval_shape(told, road)
-    assert info["reference"].shape == (policy.interface["horizon"], 4)
+    assert info.lane.reference.shape == (policy.interface["horizon"], 4)
     assert {"clearance", "offset", "admissible", "stopping", "corridor"} <= set(info)
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
         jax.eval_shape(told, road._replace(left=jnp.ones(3)))

@@ -52,16 +52,16 @@ def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(
         state, seen = controller.init(jax.random.key(0)), OFFSET.copy()
         seen[entry] = value
         _, state, info = act(params, state, seen, ENV, REFERENCE)
-        assert bool(info["healthy"])
+        assert bool(info.healthy)
         assert np.all(np.abs(state.plan) <= span * (1 + 1e-6))
 
 
 def test_an_environment_outside_the_box_is_clamped_and_flagged():
     outside, edge = np.float32([1.5, -20.0]), np.float32([0.9, -8.0])
     strayed, clamped = act_once(env=outside), act_once(env=edge)
-    assert not bool(strayed[2]["env_inside"])
-    assert bool(clamped[2]["env_inside"])
-    assert bool(strayed[2]["healthy"])
+    assert not bool(strayed[2].env_inside)
+    assert bool(clamped[2].env_inside)
+    assert bool(strayed[2].healthy)
     np.testing.assert_array_equal(strayed[0], clamped[0])
     assert not np.array_equal(act_once()[1].controls, clamped[1].controls)
 

@@ -158,7 +158,7 @@ def planned(wheelbase, starts, speeds):
             u, memory, info = planner.act({}, memory, state, jnp.zeros(2), window)
             state = step(state, u, jnp.zeros(2))
             along, _ = scenarios.project(road, state[:2], along)
-            return (state, along, memory), (state, u, info["healthy"])
+            return (state, along, memory), (state, u, info.healthy)
 
         begin = (start, start[0], planner.init(jax.random.key(0)))
         return jax.lax.scan(advance, begin, length=250)[1]

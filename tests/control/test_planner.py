@@ -97,20 +97,20 @@ def test_on_a_linear_quadratic_problem_the_cost_is_near_the_optimum(search):
     least, _ = optimal()
     task = double_integrator()
     _, _, info = plan_for(search, task, noise_std=(1.0,))
-    cost = float(info["mean_cost"][-1])
+    cost = float(info.plan.mean_cost[-1])
     assert least <= cost * (1 + 1e-5)
     assert cost <= 1.02 * least
 
 
 def test_the_gradient_planner_never_goes_up_and_ends_at_the_optimal_plan():
     state, _, info = plan_for("gradient", steps=60)
-    costs = np.asarray(info["mean_cost"])
+    costs = np.asarray(info.plan.mean_cost)
     assert np.all(costs[1:] <= costs[:-1] * (1 + 1e-6))
     np.testing.assert_allclose(state.plan, optimal()[1], atol=0.05)
     # A plan of before that is worse than none does not hold it up.
     worse = tuned(state._replace(plan=-9.0 * state.plan), elapsed=0.0)
     _, _, info = act(SEARCHES["gradient"](double_integrator()), worse)
-    assert info["mean_cost"] <= HORIZON * Q[0] * START[0] ** 2
+    assert info.plan.mean_cost <= HORIZON * Q[0] * START[0] ** 2
 
 
 @every
@@ -151,8 +151,8 @@ def test_a_planner_of_ones_own_is_a_search_and_has_all_settings_of_planners():
     held = tuned(planner.init(jax.random.key(0)), elapsed=0.0)
     _, state, first = act(planner, held)
     _, state, later = act(planner, tuned(state, elapsed=0.0))
-    assert bool(later["healthy"])
-    assert later["cost"] <= first["cost"] * (1 + 1e-5)
+    assert bool(later.healthy)
+    assert later.plan.cost <= first.plan.cost * (1 + 1e-5)
 
 
 # ---- what is data
@@ -194,7 +194,7 @@ def test_a_late_call_continues_the_plan_from_where_it_would_be_by_then():
         state = tuned(planner.init(jax.random.key(0)), elapsed=told)
         state = state._replace(plan=plan, controls=plan)
         action, after, info = run(None, state, START * jnp.nan, NOTHING, ())
-        assert not bool(info["healthy"])
+        assert not bool(info.healthy)
         elapsed = 1.0 if np.isnan(told) else told
         late = max(elapsed - 1.0, 0.0)
         np.testing.assert_allclose(action, 0.1 * late, atol=1e-6)
@@ -212,10 +212,10 @@ def test_one_finite_rollout_is_enough_and_none_keeps_the_last_plan(search):
 
     planner = SEARCHES[search](double_integrator(breaking))
     action, state, info = act(planner)  # only the plan of zeros survives
-    assert bool(info["healthy"])
+    assert bool(info.healthy)
     np.testing.assert_array_equal(action, 0.0)
     action, state, info = act(planner, state, env=jnp.ones(1))  # and now nothing does
-    assert not bool(info["healthy"])
+    assert not bool(info.healthy)
     assert np.all(np.isfinite(action))
     assert np.all(np.isfinite(state.plan))
 
@@ -228,9 +228,9 @@ def test_a_temperature_that_is_not_positive_is_reported_and_changes_no_plan(
     planner = control.mppi(double_integrator(), num_samples=64, **FEW)
     bad = tuned(act(planner)[1], temperature=temperature)
     action, state, info = act(planner, bad)
-    assert not bool(info["healthy"])
+    assert not bool(info.healthy)
     np.testing.assert_array_equal(action, bad.controls[0])
-    assert bool(act(planner, tuned(state, temperature=5.0))[2]["healthy"])
+    assert bool(act(planner, tuned(state, temperature=5.0))[2].healthy)
     with pytest.raises(ValueError, match="temperature must be in"):
         control.mppi(double_integrator(), temperature=temperature, **FEW)
 
@@ -260,7 +260,7 @@ def test_invalid_settings_are_refused_by_name(search, settings, words):
 def test_strict_promotion_of_types_and_ranks_is_no_obstacle():
     planner = SEARCHES["mppi"](double_integrator())
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        assert bool(act(planner, env=jnp.zeros(2))[2]["healthy"])
+        assert bool(act(planner, env=jnp.zeros(2))[2].healthy)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,7 @@ def test_observations_of_any_type_are_planned_from(search, kind, double):
     with jax.enable_x64(double):
         planner = SEARCHES[search](double_integrator())
         u, state, info = act(planner, x=np.asarray([1, 0], kind))
-        assert bool(info["healthy"])
+        assert bool(info.healthy)
         assert u.dtype == state.plan.dtype == (jnp.float64 if double else jnp.float32)
         assert u < 0
 
@@ -298,10 +298,8 @@ def test_state_environment_and_reference_may_be_any_trees():
     planner = SEARCHES["mppi"](double_integrator(move, cost))
     start, goals = Body(*map(jnp.asarray, (1.0, 0.0, 0))), {"place": jnp.zeros(HORIZON)}
     info = act(planner, None, start, {"gain": jnp.ones(())}, goals)[2]
-    assert info["predicted_states"].position.shape == (HORIZON,)
-    np.testing.assert_array_equal(
-        info["predicted_states"].steps, np.arange(1, HORIZON + 1)
-    )
+    assert info.plan.states.position.shape == (HORIZON,)
+    np.testing.assert_array_equal(info.plan.states.steps, np.arange(1, HORIZON + 1))
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import sfkd_jax
 from sfkd_jax import build, control, scenarios
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
+from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.plants import kinematic
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
@@ -74,7 +75,8 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
 
 def about(xi, preview):
     """What the adapter needs of a planner."""
-    return {"predicted_states": jnp.tile(xi, (preview.road.shape[0], 1))}
+    ahead = jnp.tile(xi, (preview.road.shape[0], 1))
+    return ControllerInfo(plan=PlanInfo(states=ahead))
 
 
 def scripted():
@@ -158,20 +160,17 @@ def attacked():
 def test_car_and_nominal_model_stay_in_their_corridors_whatever_is_planned(name):
     xi, controls, info = attacked()[name]
     assert np.all(np.isfinite(controls))
-    assert np.max(np.abs(info["nominal_state"][:, 0])) <= WIDTH + 1e-6
+    assert np.max(np.abs(info.shield.nominal_state[:, 0])) <= WIDTH + 1e-6
     assert np.max(np.abs(xi[:, 0])) <= WIDTH + TUBE + 1e-5
-    assert np.max(np.abs(xi[:, 0] - info["nominal_state"][:, 0])) <= TUBE
-    assert np.all(np.abs(info["perturbation"]) <= LIMIT)
-    assert not np.any(
-        info["bound_exceeded"] | info["outside_box"] | info["dead_reckoning"]
-    )
-    np.testing.assert_allclose(info["corridor"], WIDTH + TUBE, rtol=1e-6)
+    assert np.max(np.abs(xi[:, 0] - info.shield.nominal_state[:, 0])) <= TUBE
+    assert np.all(np.abs(info.shield.perturbation) <= LIMIT)
+    assert np.all(info.claim.reason == Reason.CERTIFIED)
+    np.testing.assert_allclose(info.claim.bound, WIDTH + TUBE, rtol=1e-6)
     if name == "nan":  # the tube is not far too wide
-        assert abs(xi[-1, 0] - info["nominal_state"][-1, 0]) > 0.99 * TUBE
+        assert abs(xi[-1, 0] - info.shield.nominal_state[-1, 0]) > 0.99 * TUBE
     # The preview is constant, so the filter has already predicted the law's next steps.
-    assert np.all(info["feasible"])
-    assert np.all(info["margin"] >= 0.0)
-    assert np.array_equal(info["shield_healthy"], np.ones(STEPS, bool))
+    assert np.all(info.shield.margin >= 0.0)
+    assert np.array_equal(info.claim.holds, np.ones(STEPS, bool))
 
 
 def test_without_the_filter_the_same_planners_leave_the_corridor():
@@ -181,7 +180,7 @@ def test_without_the_filter_the_same_planners_leave_the_corridor():
     xi, _, _ = jit(jax.vmap(lambda script: alone(script, WORST)))(jnp.asarray(clipped))
     assert np.all(np.max(np.abs(xi[:, :, 0]), axis=1) > 1.5 * (WIDTH + TUBE))
     for name in names:
-        assert np.sum(attacked()[name][2]["intervention"] > 0.0) > 10
+        assert np.sum(attacked()[name][2].shield.intervention > 0.0) > 10
 
 
 def test_who_asks_for_little_is_left_alone():
@@ -198,13 +197,13 @@ def test_who_asks_for_little_is_left_alone():
         )
     )(xi)
     np.testing.assert_allclose(controls, planned, rtol=1e-6)
-    np.testing.assert_allclose(info["perturbation"], script, atol=1e-6)
-    assert not np.any(info["intervention"])
+    np.testing.assert_allclose(info.shield.perturbation, script, atol=1e-6)
+    assert not np.any(info.shield.intervention)
     # Of bounds that are not the vehicle's own nothing is claimed, and all is driven.
     unclaimed = jit(partial(drive, filtered(claimed=False)))
     _, again, info = unclaimed(script, jnp.zeros((40, 3)), (0.05, 0.0, 8.0))
     np.testing.assert_array_equal(again, controls)
-    assert np.all(np.isnan(info["corridor"]))
+    assert np.all(np.isnan(info.claim.bound))
 
 
 def margin_of(xi, nu, road):
@@ -294,15 +293,17 @@ def test_a_second_without_observations_is_driven_by_the_nominal_model():
     xi, controls, info = jit(partial(drive, filtered()))(
         resonant, disturbances, seen=seen
     )
-    assert list(np.flatnonzero(info["dead_reckoning"])) == list(range(20, 30))
+    assert list(np.flatnonzero(info.claim.reason == Reason.NOT_MEASURED)) == list(
+        range(20, 30)
+    )
     # At 30 the nominal model starts anew, and there is nothing to compare.
-    unknown = np.flatnonzero(np.isnan(info["nominal_distance"]))
+    unknown = np.flatnonzero(np.isnan(info.shield.nominal_distance))
     assert list(unknown) == [0, *range(20, 31)]
-    assert not np.any(info["shield_healthy"][20:30])
+    assert not np.any(info.claim.holds[20:30])
     assert np.all(np.isfinite(controls))
     # It may start outside its corridor, and is steered back before anything is claimed.
-    nominal = np.abs(info["nominal_state"][:, 0])
-    claimed = np.asarray(info["shield_healthy"])
+    nominal = np.abs(info.shield.nominal_state[:, 0])
+    claimed = np.asarray(info.claim.holds)
     assert np.all(nominal[claimed] <= WIDTH + 1e-6)
     assert np.all(np.abs(xi[:, 0]) <= WIDTH + TUBE)
     assert np.all(claimed[40:])
@@ -324,9 +325,9 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
             quiet, memory, vehicle_state(xi), observed_envs[k], reference
         )
         assert np.all(np.isfinite(action))
-        distances.append(float(jnp.abs(xi - info["nominal_state"])[0]))
-        inside.append(bool(info["env_inside"]))
-        inputs = jnp.concatenate([info["perturbation"], jnp.asarray([0.0, SPEED])])
+        distances.append(float(jnp.abs(xi - info.shield.nominal_state)[0]))
+        inside.append(bool(info.env_inside))
+        inputs = jnp.concatenate([info.shield.perturbation, jnp.asarray([0.0, SPEED])])
         xi = TOY.decode(
             envs[k], TOY.step(envs[k], TOY.encode(envs[k], path_state(xi)), inputs)
         )[BODY]
@@ -340,10 +341,12 @@ def test_a_car_outside_its_bound_is_reported_and_followed():
     kick[9, 0] = 0.5
     controller = filtered(width=1.0, noise_allowance=0.01)
     xi, _, info = jit(partial(drive, controller))(jnp.zeros((20, 2)), kick)
-    np.testing.assert_array_equal(np.flatnonzero(info["bound_exceeded"]), [10])
-    np.testing.assert_allclose(info["nominal_distance"][10], 0.5, atol=1e-4)
-    np.testing.assert_allclose(info["nominal_state"][10:], xi[10:], atol=1e-4)
-    assert not info["shield_healthy"][10]
+    np.testing.assert_array_equal(
+        np.flatnonzero(info.claim.reason == Reason.BOUND_EXCEEDED), [10]
+    )
+    np.testing.assert_allclose(info.shield.nominal_distance[10], 0.5, atol=1e-4)
+    np.testing.assert_allclose(info.shield.nominal_state[10:], xi[10:], atol=1e-4)
+    assert not info.claim.holds[10]
 
 
 def test_outside_a_box_the_law_drives_alone():
@@ -365,12 +368,13 @@ def test_outside_a_box_the_law_drives_alone():
         observed = vehicle_state(seen["state"]), seen["env"], seen["road"]
         _, _, info = act(wanted, memory, *observed)
         outside = name is not None
-        assert bool(info["outside_box"]) == outside
-        assert bool(info["shield_healthy"]) != outside
+        expected = Reason.OUTSIDE_BOX if outside else Reason.CERTIFIED
+        assert Reason(int(info.claim.reason)) == expected
+        assert bool(info.claim.holds) != outside
         expected = 0 * LIMIT if outside else wanted[0]
-        np.testing.assert_allclose(info["perturbation"], expected, atol=1e-6)
-        assert float(info["intervention"]) == float(outside)
-        assert bool(info["env_inside"]) == (name != "env")
+        np.testing.assert_allclose(info.shield.perturbation, expected, atol=1e-6)
+        assert float(info.shield.intervention) == float(outside)
+        assert bool(info.env_inside) == (name != "env")
 
 
 def test_before_anything_is_seen_the_planner_passes_within_the_limits():
@@ -387,11 +391,13 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
         for planned, passed in cases:
             action, after, info = act(jnp.asarray(planned), start, *seen)
             np.testing.assert_allclose(action, passed)
-            assert not bool(after.inner.inner.started | info["shield_healthy"])
-            assert not bool(info["feasible"] | info["outside_box"])
-            assert np.isnan(float(info["margin"]))
+            assert not bool(after.inner.inner.started | info.claim.holds)
+            unreadable = not np.all(np.isfinite(seen[2]))
+            reason = Reason.BAD_REFERENCE if unreadable else Reason.NOT_MEASURED
+            assert Reason(int(info.claim.reason)) == reason
+            assert np.isnan(float(info.shield.margin))
     _, after, info = act(jnp.asarray([0.1, 0.7]), after, xi, ENV, reference)
-    assert bool(after.inner.inner.started & info["shield_healthy"])
+    assert bool(after.inner.inner.started & info.claim.holds)
 
 
 @pytest.mark.parametrize(
@@ -508,17 +514,19 @@ FAULTS = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_what_one_step_cannot_explain_is_not_followed(name):
     xi, info = told(FAULTS[name])
-    lost = np.asarray(info["dead_reckoning"])
+    lost = np.asarray(info.claim.reason == Reason.NOT_MEASURED)
     assert np.max(np.abs(xi[:, 0])) < 0.1
     assert lost.any()
     assert np.all(np.flatnonzero(lost) >= 40)
     # No claim and no health while something is not measured, and both afterwards.
-    assert not np.any(info["healthy"][lost])
-    assert np.all(np.isnan(np.asarray(info["corridor"])[lost]))
-    assert np.all(np.asarray(info["healthy"])[~lost])
+    assert not np.any(info.healthy[lost])
+    assert np.all(np.isnan(np.asarray(info.claim.bound)[lost]))
+    assert np.all(np.asarray(info.healthy)[~lost])
     if name == "jump":
         # The heading is still measured, the position is not.
-        assert np.asarray(info["measured"])[lost].tolist() == [[False, True, True]] * 18
+        assert (
+            np.asarray(info.gate.measured)[lost].tolist() == [[False, True, True]] * 18
+        )
 
 
 def test_a_model_that_nothing_is_known_of_overrules_no_measurement():
@@ -527,7 +535,7 @@ def test_a_model_that_nothing_is_known_of_overrules_no_measurement():
 
     controller = gated(scripted(), model=TOY._replace(step=wrong))
     _, _, info = drive(controller, jnp.zeros((50, 2)), np.zeros((50, 3)))
-    assert np.all(info["measured"])
+    assert np.all(info.gate.measured)
 
 
 def test_a_delay_is_recognised_and_made_up_for_far_beyond_the_patience():
@@ -536,8 +544,11 @@ def test_a_delay_is_recognised_and_made_up_for_far_beyond_the_patience():
     late = partial(told, lambda o, k: o, 160, push)
     for lag in (3, 10):
         xi, info = late(lambda k, lag=lag: jnp.where(between(k, 40, 90), lag, 0))
-        assert np.all(info["dead_reckoning"] == between(np.arange(160), 40, 90))
-        assert not np.any(info["healthy"][40:90])
+        assert np.all(
+            (info.claim.reason == Reason.NOT_MEASURED)
+            == between(np.arange(160), 40, 90)
+        )
+        assert not np.any(info.healthy[40:90])
         assert np.max(np.abs(xi[:, 0])) < 0.1
     blind = lambda o, k: jnp.where(between(k, 40, 90), jnp.nan, o)
     assert np.max(np.abs(told(blind, 160, push, patience=9.0)[0][:, 0])) > 0.2
@@ -546,12 +557,12 @@ def test_a_delay_is_recognised_and_made_up_for_far_beyond_the_patience():
 def test_after_its_patience_a_measurement_is_believed_and_nothing_claimed_for_a_while():
     xi, info = told(FAULTS["jump"], patience=1.0, trial=3.0)
     believed = 40 + 10
-    assert np.asarray(info["dead_reckoning"])[40:believed].all()
-    assert np.asarray(info["measured"])[believed].all()
+    assert np.asarray(info.claim.reason == Reason.NOT_MEASURED)[40:believed].all()
+    assert np.asarray(info.gate.measured)[believed].all()
     # True again at 58, but not before its patience: only then the trial begins anew.
     assert np.max(np.abs(xi[:believed, 0])) < 0.1
     assert np.max(np.abs(xi[:, 0])) < 3.1
-    assert not np.any(info["shield_healthy"][40 : believed + 30])
+    assert not np.any(info.claim.holds[40 : believed + 30])
 
 
 def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause():
@@ -569,26 +580,26 @@ def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause
     )
     blind = lambda o, k: jnp.where(between(k, 61, 66), jnp.nan, o)
     _, info = told(blind, steps=160, disturbances=pushed, test=test)
-    alarm = np.asarray(info["innovation_alarm"])
+    alarm = np.asarray(info.gate.alarm)
     assert not alarm[:41].any()
     assert alarm[55:66].all()
     assert not alarm[140:].any()
-    assert not np.any(info["healthy"][alarm])
-    assert np.isnan(np.asarray(info["corridor"])[alarm]).all()
-    assert np.all(np.isfinite(np.asarray(info["corridor"])[140:]))
-    assert np.all(info["healthy"][140:])
+    assert not np.any(info.healthy[alarm])
+    assert np.isnan(np.asarray(info.claim.bound)[alarm]).all()
+    assert np.all(np.isfinite(np.asarray(info.claim.bound)[140:]))
+    assert np.all(info.healthy[140:])
 
 
 def test_who_is_blind_for_good_brakes():
     xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=170)
-    assert not np.any(info["healthy"][40:])
+    assert not np.any(info.healthy[40:])
     # The toy's law wants back to the old speed; the car slows down all the same.
     assert xi[-1, 2] < 6.0
 
 
 def test_the_bound_of_a_start_at_a_measurement_decays_to_the_certified_one():
     _, info = told(lambda o, k: o, steps=60)
-    corridor = np.asarray(info["corridor"])
+    corridor = np.asarray(info.claim.bound)
     expected = WIDTH + TUBE + 0.05 * 0.9 ** np.arange(60)
     np.testing.assert_allclose(corridor, expected, rtol=1e-5)
 
@@ -603,8 +614,8 @@ def test_before_the_first_environment_the_law_drives_with_the_middle_of_its_box(
     road = jnp.asarray([0.0, SPEED])
     wanted = LAW(xi, *road, jnp.asarray([0.6, 0.0]))
     np.testing.assert_allclose(action, wanted, rtol=1e-6)
-    assert not bool(info["healthy"])
-    assert not bool(info["env_inside"])
+    assert not bool(info.healthy)
+    assert not bool(info.env_inside)
 
 
 def test_braking_passes_and_the_steering_stays_with_the_filter():
@@ -615,9 +626,9 @@ def test_braking_passes_and_the_steering_stays_with_the_filter():
         steering, drive_of_law = LAW(xi[k], *road, ENV)
         assert abs(controls[k, 0] - steering) <= LIMIT[0] + 1e-6
         np.testing.assert_allclose(controls[k, 1], drive_of_law - 4.0, rtol=1e-5)
-    assert np.all(info["braking"])
-    assert not np.any(info["healthy"])
-    assert np.all(np.isnan(info["corridor"]))
+    assert np.all(info.claim.reason == Reason.BRAKING)
+    assert not np.any(info.healthy)
+    assert np.all(np.isnan(info.claim.bound))
 
 
 def test_another_call_rate_is_not_healthy():
@@ -636,8 +647,8 @@ def test_another_call_rate_is_not_healthy():
         late = gate.inner._replace(inner=_Timed(jnp.asarray(elapsed)))
         state = start._replace(inner=gate._replace(inner=late))
         _, _, info = jit(controller.act)({}, state, vehicle_state(xi), ENV, circle())
-        assert bool(info["healthy"]) == healthy
-        assert np.isfinite(info["corridor"]) == healthy
+        assert bool(info.healthy) == healthy
+        assert np.isfinite(info.claim.bound) == healthy
 
 
 class _Tuning(NamedTuple):
@@ -659,8 +670,8 @@ def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(ca
     plant, law, count = policy.vehicle, policy.law, len(policy.vehicle.state_names)
 
     def follows(params, memory, xi, env, preview):
-        healthy = {"healthy": jnp.asarray(True)} | about(xi, preview)
-        return law(xi, *preview.road[0], env) + 0.3 * LIMIT, memory, healthy
+        control = law(xi, *preview.road[0], env) + 0.3 * LIMIT
+        return control, memory, about(xi, preview)
 
     planner = Controller(lambda key: (), follows)
     guard = policy.guard(planner, along_path=True)
@@ -687,7 +698,7 @@ def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(ca
                 policy.params, memory, seen, road.envs[k], window
             )
             after = plant.step(state, action, road.envs[k])
-            told = info["corridor"], info["rolling"], info["shield_healthy"]
+            told = info.claim.bound, info.shield.rolling, info.claim.holds
             return (after, memory), (*foot, state[3], *told)
 
         start = road.initial_state, guard.init(key)

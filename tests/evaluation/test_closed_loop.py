@@ -13,6 +13,7 @@ from helpers import at, jit, same
 from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax.evaluation import _loops, disturbed_environment
 from sfkd_jax.evaluation.metrics import SIGNALS
+from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.types import Controller
 
 PLANT, DYNAMIC = plants.kinematic(), plants.dynamic()
@@ -49,7 +50,7 @@ def program(step):
             dt=DT,
             horizon=HORIZON,
             observation_noise=tuple(noise),
-            record={"expected": lambda info: info["predicted_states"][0, :2]},
+            record={"expected": lambda info: info.plan.states[0, :2]},
         )
 
     return jit(jax.vmap(one, in_axes=(None, 0, 0)))
@@ -114,7 +115,7 @@ def still(gain=1.0, planner_draws=1):
     """
 
     def act(params, state, observation, env, reference):
-        info = {"effective_samples": env[1], "healthy": jnp.asarray(True)}
+        info = ControllerInfo(plan=PlanInfo(effective_samples=env[1]))
         for _ in range(planner_draws):
             state, _ = jax.random.split(state)
         return gain * observation[:2], state, info

@@ -74,18 +74,19 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
         def record(
             observation: Any, env: Any, control: Any, info: Any, time: Any = None
         ) -> None:
-            if "perturbation" not in info:
+            shield = getattr(info, "shield", None)
+            if shield is None:
                 raise ValueError("only a policy with a shield has runs to collect")
-            if not info["env_inside"]:
+            if not info.env_inside:
                 warnings.warn(f"e left {box}: no corridor. The unit?", stacklevel=2)
             row = [
                 dt * next(row_numbers) if time is None else time,
                 *observation,
-                *info["path_state"][:2],
+                *info.path.xi[:2],
                 *control,
                 *env[:env_size],
-                *info["perturbation"],
-                *info["road"],
+                *shield.perturbation,
+                *info.path.road,
             ]
             file.write(",".join(f"{float(value):.12g}" for value in row) + "\n")
 

@@ -145,10 +145,10 @@ def simulate(
         )
         if scenario.course is not None:
             assert size is not None
-            info["gap"] = car_clearance(ahead[1], state, size=size)
-            if "reference" in info:
+            info = info._replace(gap=car_clearance(ahead[1], state, size=size))
+            if info.lane is not None:
                 # The first point of the reference is where the car should be now.
-                reference = info["reference"]
+                reference = info.lane.reference
                 curvature = curvature_ahead(reference)[0]
                 lateral = path_coordinates(state, reference[0], curvature)[LATERAL]
         signals = {name: signal(info) for name, signal in recorded.items()}

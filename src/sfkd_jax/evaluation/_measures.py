@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sfkd_jax.types import ControllerInfo
+from sfkd_jax.info import ControllerInfo
 
 PerEpisode: TypeAlias = Float[np.ndarray, " episode"] | Bool[np.ndarray, " episode"]
 """One value per episode. NaN stands for an episode that has no such value."""
@@ -143,19 +143,19 @@ def below_claim(run: Recording) -> np.ndarray:
 
 def healthy(info: ControllerInfo) -> Any:
     """Return whether the control is the plan of a working planner."""
-    return info["healthy"]
+    return info.healthy
 
 
 def effective_samples(info: ControllerInfo) -> Any:
     """Return the effective number of samples; NaN if nothing is sampled."""
-    return info["effective_samples"]
+    return info.plan.effective_samples
 
 
 def gap(info: ControllerInfo) -> Any:
     """Return the true distance from the nearest obstacle [m]; NaN without obstacles."""
-    return info.get("gap", math.nan)
+    return math.nan if info.gap is None else info.gap
 
 
 def claimed_clearance(info: ControllerInfo) -> Any:
     """Return the distance that the controller claims [m]; NaN where it claims none."""
-    return info.get("clearance", math.nan)
+    return math.nan if info.lane is None else info.lane.clearance

@@ -30,7 +30,7 @@ from sfkd_jax.evaluation.formats import (
     short,
     upper,
 )
-from sfkd_jax.types import ControllerInfo
+from sfkd_jax.info import ControllerInfo
 
 Row: TypeAlias = dict[str, Any]
 """One system on one scenario, as in results.json."""

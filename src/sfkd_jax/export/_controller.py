@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sfkd_jax import build, policy, store
+from sfkd_jax.info import ControllerInfo
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
 from sfkd_jax.policy import Policy
@@ -205,7 +206,7 @@ def flat_programs(
         act: (state leaves, observation, env, *ahead)
              -> (control, state leaves, info leaves)
 
-    Names are paths, such as `state.plan` and `info.cost`. Keys are uint32 data.
+    Names are paths, such as `state.plan` and `info.plan.cost`. Keys are uint32 data.
 
     Args:
         trained: the policy.
@@ -236,7 +237,7 @@ def flat_programs(
         params = jax.lax.optimization_barrier(trained.params)
         before = jax.tree.unflatten(structure, state_leaves)
         control, after, info = act(params, before, *measurements)
-        return control, *_unpack(after), *jax.tree.leaves(info)
+        return control, *_unpack(after), *jax.tree.leaves(_reported(info))
 
     control, after, info = jax.eval_shape(act, trained.params, state, *measured)
     states = _named("state", state)
@@ -247,11 +248,16 @@ def flat_programs(
             "shapes or dtypes"
         )
     inputs = (*states, *map(_leaf, names, measured))
-    outputs = (_leaf("control", control), *states, *_named("info", info))
+    outputs = (_leaf("control", control), *states, *_named("info", _reported(info)))
     return {
         "init": Program(flat_init, (_leaf("key", key),), states),
         "act": Program(flat_act, inputs, outputs),
     }
+
+
+def _reported(info: ControllerInfo) -> dict[str, Any]:
+    """Return the parts of an `info` by name, with what follows from them."""
+    return {"healthy": info.healthy, **info._asdict()}
 
 
 def in_window(

@@ -24,6 +24,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -91,11 +92,12 @@ class ExportedController:
         reference: Any,
         *,
         elapsed: float | None = None,
-    ) -> tuple[jax.Array, dict[str, jax.Array], dict[str, Any]]:
+    ) -> tuple[jax.Array, dict[str, jax.Array], SimpleNamespace]:
         """Return (control, next state, info) of one control step.
 
         Values that are not finite are passed on; the controller then continues its last
-        plan, and `info` reports it. Positions on Earth must be float64.
+        plan, and `info` reports it, such as `info.healthy` and `info.claim.bound`.
+        Positions on Earth must be float64.
 
         Args:
             state: from `init` or the previous step.
@@ -129,10 +131,10 @@ class ExportedController:
         info = self._named("act", "info", values)
         self._warn_outside_box(info)
         if origin.any():
-            for name in {"predicted_states", "reference"} & set(info):
+            for name in {"plan.states", "lane.reference"} & set(info):
                 moved: Any = _shifted(info[name], origin)
                 info[name] = moved
-        return values[0], after, info
+        return values[0], after, _nested(info)
 
     def _inputs(
         self,
@@ -190,6 +192,20 @@ class ExportedController:
             for name, value in zip(names, values, strict=True)
             if name.startswith(f"{root}.")
         }
+
+
+def _nested(values: dict[str, Any]) -> SimpleNamespace:
+    """Return values with names such as `plan.cost` as attributes of attributes."""
+    root = SimpleNamespace()
+    for name, value in values.items():
+        *parts, last = name.split(".")
+        node = root
+        for part in parts:
+            if not hasattr(node, part):
+                setattr(node, part, SimpleNamespace())
+            node = getattr(node, part)
+        setattr(node, last, value)
+    return root
 
 
 def _shifted(states: Any, by: np.ndarray) -> np.ndarray:

@@ -81,7 +81,7 @@ class Policy(TrainedModel):
         Args:
             planner: its `act` receives the params of the policy (bind others with
                 `partial`), the observation, e and the reference, and returns a control
-                of the vehicle. Entries of its `info` appear in that of the guard.
+                of the vehicle. Its `info` is the part `planner` of that of the guard.
             along_path: whether it takes ξ and a preview instead of observation and
                 reference, see `control.along_reference`.
 
@@ -294,8 +294,8 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
         )
         if moved:
             # What is reported is in the world again, on the host in float64.
-            states = shifted(info["predicted_states"], origin)
-            info = {**info, "predicted_states": states}
+            states = shifted(info.plan.states, origin)
+            info = info._replace(plan=info.plan._replace(states=states))
         return control, state, info
 
     return _in_policy_numerics(Controller(init, act))

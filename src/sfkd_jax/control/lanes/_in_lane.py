@@ -21,6 +21,7 @@ from sfkd_jax.control.lanes._reference import (
     speed_profile,
     window,
 )
+from sfkd_jax.info import ControllerInfo, LaneInfo, Reason
 from sfkd_jax.lanes import Lane, Obstacles, finite
 from sfkd_jax.paths import Lap, point_at, project
 from sfkd_jax.ranges import (
@@ -34,7 +35,6 @@ from sfkd_jax.types import (
     GRAVITY,
     Control,
     Controller,
-    ControllerInfo,
     Environment,
     Key,
     Params,
@@ -79,22 +79,14 @@ class InLane(Stateful):
     reference is committed. If none is admissible, the committed reference stays as long
     as it is free. Otherwise the car brakes on it, to stand in front of what is in the
     way. If it would not stand in time, it evades with all of the grip, outside the
-    class and without a claim: `corridor` and `clearance` are then NaN. If a number of
+    class and without a claim: the bound and `clearance` are then NaN. If a number of
     the scene is not finite, the car stops.
 
     `act` takes a scene (lane and obstacles) in place of the reference. `info` gains
-    these entries:
-
-        reference   the window that `inner` follows
-        offset      of the reference from the centre line [m]
-        clearance   distance that the car keeps from all obstacles along the whole
-                    committed reference [m]; NaN where no corridor holds
-        admissible  whether the committed reference is free, and inside class and lane
-        stopping    whether the committed reference ends at rest
-        evading     whether the committed reference is outside the class
+    `lane`, see `LaneInfo`.
 
     Attributes:
-        inner: controller in the world; its `info` has the `corridor` of the reference.
+        inner: controller in the world; its `info` has the claim about the reference.
         planner: of `Manoeuvres.task`, with horizon 1.
         manoeuvres: the references to choose from.
         horizon: number of points of the reference that `inner` reads.
@@ -182,25 +174,26 @@ class InLane(Stateful):
             params, state.inner, observation, env, ahead
         )
         # Outside the class, and until its errors have decayed, nothing is certified.
-        corridor = jnp.where(doubt > 0, jnp.nan, info.get("corridor", jnp.nan))
+        claim = info.claim.unless(doubt > 0, Reason.EVADING)
         # The gap is beyond the corridor of the certificate; this step has its own.
-        excess = corridor - task.kind.corridor
+        excess = claim.bound - task.kind.corridor
         room = jnp.min(judged.gap) - excess
-        report: Any = {
-            **info,
-            "healthy": info["healthy"] & clean & (doubt == 0),
-            "corridor": corridor,
-            "reference": ahead,
-            "offset": committed.move[0, BEHIND],
-            "clearance": jnp.where(clean, room, jnp.nan),
-            "admissible": judged.violation <= 0.0,
-            "stopping": ~judged.curve.reached[-1],
-            "evading": evading,
-        }
+        info = info._replace(
+            plan=info.plan._replace(healthy=info.plan.healthy & clean),
+            claim=claim,
+            lane=LaneInfo(
+                reference=ahead,
+                offset=committed.move[0, BEHIND],
+                clearance=jnp.where(clean, room, jnp.nan),
+                admissible=judged.violation <= 0.0,
+                stopping=~judged.curve.reached[-1],
+                evading=evading,
+            ),
+        )
         wait = jnp.where(due, self.period, state.wait) - 1
         started = state.started | all_finite(observation)
         after = LaneState(inner, planner, committed, progress, wait, started, doubt)
-        return control, after, report
+        return control, after, info
 
     def _situation(
         self,
@@ -276,9 +269,9 @@ class InLane(Stateful):
         # The planner observes a situation; it needs neither e nor a reference.
         act: Any = self.planner.act
         row, after, info = act(None, planner, situation, None, None)
-        usable = info["healthy"] & info["constraints_kept"]
+        usable = info.plan.healthy & (info.plan.violation <= 0.0)
         # A plan that goes on with an old one is not the one that was evaluated.
-        cost = jnp.where(usable, info["mean_cost"], jnp.inf)
+        cost = jnp.where(usable, info.plan.mean_cost, jnp.inf)
         rows = jnp.concatenate([row[None], task.ways_round(situation)])
 
         def cost_of(row: Control) -> Scalar:

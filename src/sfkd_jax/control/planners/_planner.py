@@ -15,8 +15,9 @@ from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.planners._rollouts import Evaluated, Plan, Plans, Rollouts
 from sfkd_jax.control.tasks._task import PlanningStart, Task
+from sfkd_jax.info import Claim, ControllerInfo, PlanInfo, Reason, first
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
-from sfkd_jax.types import Control, ControllerInfo, Key, Params, Scalar
+from sfkd_jax.types import Control, Key, Params, Scalar
 
 Evaluate: TypeAlias = Callable[[Plans], Evaluated]
 """A function that rolls out plans, (horizon, sample, control)."""
@@ -76,15 +77,6 @@ class ChosenPlan(NamedTuple):
     states: Any
     violation: Scalar | None
 
-    def constraint_info(self) -> dict[str, Any]:
-        """Return the entries of `info` about constraints; none without constraints."""
-        if self.violation is None:
-            return {}
-        return {
-            "violation": self.violation,
-            "constraints_kept": self.violation <= 0.0,
-        }
-
 
 class SearchResult(NamedTuple):
     """The outcome of a search.
@@ -110,7 +102,7 @@ class Planner(Stateful):
 
     Values that are not finite never enter the plan. If no rollout is finite, or the
     observation, environment or reference is not finite, the controller goes on with the
-    last healthy plan and `info["healthy"]` is False. `info["healthy"]` is also False
+    last healthy plan and `info.plan.healthy` is False. `info.healthy` is also False
     where the reference cannot be followed, see `RolloutSetup.followable`.
 
     To write another planner, define `search` in a subclass. `factory(Mine,
@@ -226,19 +218,18 @@ class Planner(Stateful):
             tuning=tuning._replace(elapsed=jnp.ones_like(tuning.elapsed)),
         )
         env_inside = jnp.asarray(True) if inside is env else jnp.all(inside == env)
-        info: Any = {
-            "cost": result.cost,
-            "mean_cost": chosen.cost,
-            "effective_samples": result.effective_samples,
-            "healthy": healthy & setup.followable,
-            "env_inside": env_inside,
-            "predicted_states": chosen.states,
-            **chosen.constraint_info(),
-        }
-        if precise is not None:
-            # A coarse plan is driven, not replaced: it is better than the last one.
-            info["precision"] = precise
-            info["healthy"] = info["healthy"] & precise
+        info = ControllerInfo(
+            plan=PlanInfo(
+                cost=result.cost,
+                mean_cost=chosen.cost,
+                effective_samples=result.effective_samples,
+                healthy=healthy,
+                states=chosen.states,
+                violation=chosen.violation,
+            ),
+            claim=_no_claim(precise, setup.followable),
+            env_inside=env_inside,
+        )
         return control, after, info
 
     def _nearest(self, env: Any) -> Any:
@@ -269,6 +260,26 @@ class Planner(Stateful):
             states=jax.tree.map(lambda leaf: leaf[:, index], evaluated.states),
             violation=violation,
         )
+
+
+def _no_claim(
+    precise: Bool[Array, ""] | None, followable: Bool[Array, ""] | bool
+) -> Claim:
+    """Return the claim of a planner alone: none, with what speaks against the inputs.
+
+    Args:
+        precise: whether the positions are resolved; None if there are none.
+        followable: whether the reference can be followed.
+    """
+    # A coarse plan is driven, not replaced: it is better than the last one.
+    coarse = False if precise is None else ~precise
+    reason = first(
+        Reason.CERTIFIED,
+        (~jnp.asarray(followable), Reason.BAD_REFERENCE),
+        (coarse, Reason.IMPRECISE),
+        (True, Reason.NO_CERTIFICATE),
+    )
+    return Claim(reason=reason)
 
 
 def iterate(

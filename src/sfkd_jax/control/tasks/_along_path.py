@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import Stateful, factory
 from sfkd_jax.control._finite import all_finite
@@ -41,13 +41,13 @@ from sfkd_jax.geometry import (
     path_coordinates,
     path_state,
 )
+from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
     POSE,
     Control,
     Controller,
-    ControllerInfo,
     Environment,
     Key,
     Params,
@@ -71,7 +71,8 @@ class Preview(NamedTuple):
         measured: which entries of ξ are measured; behind a `Gate` the others are
             predicted.
         on_time: whether the last call was one period ago.
-        trusted: whether the certificate may be claimed, see `Gate`.
+        reason: CERTIFIED if nothing in the inputs speaks against a claim, else the
+            first `Reason` that does, see `Gate`.
     """
 
     road: Float[Array, "horizon 2"]
@@ -79,7 +80,7 @@ class Preview(NamedTuple):
     repeated: Bool[Array, ""]
     measured: Bool[Array, " coordinate"]
     on_time: Bool[Array, ""]
-    trusted: Bool[Array, ""]
+    reason: Int[Array, ""]
 
 
 class AlongReferenceState(NamedTuple):
@@ -96,9 +97,8 @@ class AlongReference(Stateful):
     This is the only place where a state is projected onto the path, once per control
     step. Predicted states are mapped back beside the points of the reference.
 
-    `info` gains `path_state` (ξ; NaN if observation or reference are not finite),
-    `road` (κ and v_ref of this step; NaN likewise), `planned_path` (predicted ξ) and
-    `precision` (whether the type of the positions resolves them).
+    `info` gains `path`, see `PathInfo`; its ξ and road are NaN if the observation or
+    the reference is not finite.
 
     Attributes:
         inner: its `act` takes ξ and a `Preview` in place of observation and reference.
@@ -141,22 +141,24 @@ class AlongReference(Stateful):
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
-            trusted=precise & is_followable,
+            reason=first(
+                Reason.CERTIFIED,
+                (~(readable & is_followable), Reason.BAD_REFERENCE),
+                (~precise & all_finite(observation), Reason.IMPRECISE),
+            ),
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
-        planned = info["predicted_states"]
-        report: Any = {
-            "path_state": xi,
-            # A gate inside has already said which entries of ξ are believed.
-            **info,
-            "planned_path": planned,
-            "predicted_states": jax.vmap(beside)(planned, reference),
-            "precision": precise,
-            "road": road[0],
-        }
-        if "healthy" in report:
-            report["healthy"] &= precise & is_followable
-        return control, AlongReferenceState(inner, observation), report
+        planned = info.plan.states
+        if planned is not None:
+            states = jax.vmap(beside)(planned, reference)
+            info = info._replace(plan=info.plan._replace(states=states))
+        measured = preview.measured if info.gate is None else info.gate.measured
+        seen = jnp.where(measured, xi, jnp.nan)
+        info = info._replace(
+            claim=info.claim.under(preview.reason),
+            path=PathInfo(xi=seen, road=road[0], planned=planned),
+        )
+        return control, AlongReferenceState(inner, observation), info
 
 
 along_reference = factory(AlongReference, AlongReference.controller)

@@ -10,22 +10,17 @@ import jax.numpy as jnp
 from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, compose
+from sfkd_jax.info import ControllerInfo, PlanInfo, reported
 from sfkd_jax.rollout import Offset
 from sfkd_jax.types import (
     POSE,
     Control,
     Controller,
-    ControllerInfo,
     Key,
     Params,
     Reference,
     State,
 )
-
-PLANNED = ("cost", "mean_cost", "effective_samples", "predicted_states")
-"""Entries of `info` that a planner alone can give."""
-PLANNER_INFO = "planner_info"
-"""Entry of `info` that holds the planner's `info` on its way out of the shield."""
 
 
 class Request(NamedTuple):
@@ -67,14 +62,8 @@ def requesting(planner: Controller, horizon: int, coordinates: int) -> Controlle
         planned = jnp.asarray(planned, dtype=float)
         if planned.shape != (2,):
             raise ValueError(f"a planner's control has shape (2,), got {planned.shape}")
-        unknown = jnp.asarray(jnp.nan, dtype=float)
-        info: Any = {
-            **dict.fromkeys(PLANNED, unknown),
-            "healthy": all_finite(planned) & planner_info.get("healthy", True),
-            "env_inside": jnp.asarray(True),
-            "predicted_states": jnp.full((horizon, coordinates), unknown),
-            PLANNER_INFO: planner_info,
-        }
+        working = all_finite(planned) & reported(planner_info).healthy
+        info = ControllerInfo(plan=PlanInfo(healthy=working), planner=planner_info)
         return planned, state._replace(inner=memory), info
 
     return Controller(init, act)
@@ -84,8 +73,8 @@ def behind(shielded: Controller) -> Controller:
     """Return a shielded controller in the world whose planner is `requesting`.
 
     The planner may lie at any depth. The projection onto the path loses observation and
-    reference, so they travel in the state of the planner, past all wrappers. Entries of
-    the planner's `info` appear in that of the result.
+    reference, so they travel in the state of the planner, past all wrappers. The
+    planner's own `info` is the part `planner` of the result.
     """
 
     def act(
@@ -97,12 +86,10 @@ def behind(shielded: Controller) -> Controller:
             return node._replace(observation=observation, reference=reference)
 
         state = jax.tree.map(shown, state, is_leaf=_is_request)
-        info: Any
         control, after, info = shielded.act(params, state, observation, env, reference)
-        planner_info = info.pop(PLANNER_INFO)
-        planned = {name: planner_info[name] for name in PLANNED if name in planner_info}
-        merged: Any = {**planner_info, **info, **planned}
-        return control, after, merged
+        # What the planner planned, in the world; whether it works is known already.
+        plan = reported(info.planner).plan._replace(healthy=info.plan.healthy)
+        return control, after, info._replace(plan=plan)
 
     return Controller(shielded.init, act)
 

@@ -28,6 +28,7 @@ from sfkd_jax.control.wrappers._estimator import (
 )
 from sfkd_jax.control.wrappers._innovations import expected_coordinates
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
+from sfkd_jax.info import AdaptationInfo, ControllerInfo
 from sfkd_jax.ranges import (
     AtLeastTwo,
     Fraction,
@@ -41,7 +42,6 @@ from sfkd_jax.rollout import Offset, fold
 from sfkd_jax.types import (
     Control,
     Controller,
-    ControllerInfo,
     Environment,
     Key,
     Model,
@@ -86,10 +86,8 @@ class Adaptation(Stateful):
     that a certificate is about do not, so the rate and its witness stay what they are.
     θ is data of the state, so nothing is compiled again.
 
-    `info` gains `env_estimate` (the e that is planned with), `causes` (5,),
-    `causes_std` (5,), `rejected` (nothing was learned from the measurement) and
-    `adapting` (over the last seconds the estimates did not predict worse than the model
-    alone; otherwise they are not used).
+    `info` gains `adaptation`, see `AdaptationInfo`. The estimates are used as long as
+    they predicted no worse than the model alone over the last seconds (`adapting`).
 
     Attributes:
         inner: controller that was built with `with_offset(model)`, since it receives
@@ -238,16 +236,16 @@ class Adaptation(Stateful):
             control, jnp.asarray(self.control_low), jnp.asarray(self.control_high)
         )
 
-        report: ControllerInfo = {
-            **info,
-            "env_estimate": inside,
-            "causes": causes,
-            "causes_std": jnp.sqrt(belief.bank.variance()[size:]),
-            "rejected": rejected,
-            "adapting": adapting,
-        }
+        adaptation = AdaptationInfo(
+            env=inside,
+            causes=causes,
+            causes_std=jnp.sqrt(belief.bank.variance()[size:]),
+            rejected=rejected,
+            adapting=adapting,
+        )
         belief = belief._replace(applied=Applied(control, road, env))
-        return control, AdaptiveState(inner, belief), report
+        info = info._replace(adaptation=adaptation)
+        return control, AdaptiveState(inner, belief), info
 
     @cached_property
     def _estimator(self) -> Estimator:

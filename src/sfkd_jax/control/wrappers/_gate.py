@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control._finite import all_finite
@@ -37,12 +37,12 @@ from sfkd_jax.control.wrappers._plausibility import (
     difference,
 )
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, put
+from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     Control,
     Controller,
-    ControllerInfo,
     Environment,
     Fiber,
     Key,
@@ -68,7 +68,6 @@ class Inputs(NamedTuple):
         preview: with a finite road.
         periods: sampling periods since the last call.
         env_known: whether e was finite, or is not read.
-        clear: whether nothing was replaced, and the last call was one period ago.
     """
 
     coordinates: PathState
@@ -76,7 +75,15 @@ class Inputs(NamedTuple):
     preview: Preview
     periods: Scalar
     env_known: Bool[Array, ""]
-    clear: Bool[Array, ""]
+
+    @property
+    def reason(self) -> Int[Array, ""]:
+        """CERTIFIED if nothing was replaced, and the last call was one period ago."""
+        return first(
+            self.preview.reason,
+            (~self.env_known, Reason.BAD_ENVIRONMENT),
+            (~self.preview.on_time, Reason.OFF_SCHEDULE),
+        )
 
 
 class Tested(NamedTuple):
@@ -125,17 +132,10 @@ class Gate(Stateful):
     An environment or reference that is not finite is replaced by the last one, and by
     the middle of the box of e before the first one. The road moves on with every step.
 
-    `info` gains these entries:
-
-        measured              which coordinates are measured, (coordinate,)
-        dead_reckoning        whether a coordinate is not measured
-        innovation            ξ − ξ⁻, (coordinate,); NaN without a comparison
-        path_state            ξ where it is measured, else NaN
-        innovation_statistic  of `test`; NaN without a test
-        innovation_alarm      the vehicle or its sensors are not those of the test
-        trusted               the last call was one period ago, e and reference are
-                              finite, and there is neither a trial nor an alarm
-        healthy               False unless all of ξ is measured and trusted
+    `info` gains `gate`, see `GateInfo`. What speaks against a claim is the `reason` of
+    the preview that `inner` receives, and that of the claim: e or the reference is not
+    finite, the last call was not one period ago, a coordinate is not measured, or there
+    is an alarm or a trial.
 
     Attributes:
         inner: controller along a path.
@@ -206,13 +206,16 @@ class Gate(Stateful):
             state, inputs.coordinates, preview, inputs.periods
         )
         xi, measured, lost, _ = believed
-        complete = jnp.all(measured)
         tested = self._tested(state, inputs, measured)
-        trusted = preview.trusted & inputs.clear & (believed.state.doubt == 0)
-        trusted = trusted & ~tested.alarm
+        reason = first(
+            inputs.reason,
+            (~jnp.all(measured), Reason.NOT_MEASURED),
+            (tested.alarm, Reason.ALARM),
+            (believed.state.doubt > 0, Reason.TRIAL),
+        )
         road = self._slowed(preview.road, xi[PATH_SPEED], lost)
         shown = preview._replace(
-            road=road, along=believed.state.along, measured=measured, trusted=trusted
+            road=road, along=believed.state.along, measured=measured, reason=reason
         )
         control, inner, info = self.inner.act(
             params, state.inner, xi, inputs.env, shown
@@ -221,18 +224,16 @@ class Gate(Stateful):
             params, inputs, believed, road, control, info, tested.state
         )
         innovation = difference(inputs.coordinates, state.expected)
-        report: Any = {
-            **info,
-            "healthy": info.get("healthy", True) & complete & trusted,
-            "measured": measured,
-            "dead_reckoning": all_finite(state.expected) & ~complete,
-            "innovation": jnp.where(measured, innovation, jnp.nan),
-            "path_state": jnp.where(measured, inputs.coordinates, jnp.nan),
-            "innovation_statistic": tested.statistic,
-            "innovation_alarm": tested.alarm,
-            "trusted": trusted,
-            "env_inside": info.get("env_inside", True) & inputs.env_known,
-        }
+        info = info._replace(
+            claim=info.claim.under(reason),
+            env_inside=info.env_inside & inputs.env_known,
+            gate=GateInfo(
+                measured=measured,
+                innovation=jnp.where(measured, innovation, jnp.nan),
+                statistic=tested.statistic,
+                alarm=tested.alarm,
+            ),
+        )
         after = believed.state._replace(
             inner=inner,
             expected=expected.xi,
@@ -242,7 +243,7 @@ class Gate(Stateful):
             road=road,
             test=expected.test,
         )
-        return control, after, report
+        return control, after, info
 
     @property
     def _plausibility(self) -> Plausibility:
@@ -289,7 +290,6 @@ class Gate(Stateful):
             ),
             periods=periods,
             env_known=env_known,
-            clear=on_time & readable & env_known,
         )
 
     def _tested(
@@ -324,12 +324,13 @@ class Gate(Stateful):
             test: state of the test of the innovations; None without one.
         """
         here = road[0]
-        nearest = self.conditions.nearest(info.get("env_estimate", inputs.env))
+        env = inputs.env
         # What acts is the control and the input error that an estimator counteracts.
         acting = control
-        causes = info.get("causes")
-        if causes is not None:
-            acting = control + input_error(causes, here)
+        if info.adaptation is not None:
+            env = info.adaptation.env
+            acting = control + input_error(info.adaptation.causes, here)
+        nearest = self.conditions.nearest(env)
         turn = self.law.turn(here[0], here[1], nearest)
         fiber = None
         if self.conditions.state is not None:
@@ -345,7 +346,8 @@ class Gate(Stateful):
         if test is not None:
             rate = turning_rate(self.law, xi, acting, here, nearest)
             ahead = jnp.append(after[1], xi[HEADING] + self.dt * rate)
-            clear = inputs.clear & jnp.all(believed.measured)
+            clear = inputs.reason == Reason.CERTIFIED
+            clear = clear & jnp.all(believed.measured)
             comparable = clear & inside[1] & usual[1]
             test = test._replace(
                 expected=jnp.where(comparable, ahead, jnp.nan), level=turn.level

@@ -56,12 +56,20 @@ class Comparison(NamedTuple):
         state: with the nominal model in the fibre of the current environment, at the
             measured ξ if it starts anew.
         fiber: the fibre of the current environment.
-        flags: entries of `info` that the comparison decides.
+        nominal_state: ξ of the nominal model, (coordinate,); NaN before its start.
+        distance: |e_y − ê_y| [m]; NaN without a comparison.
+        bound_exceeded: whether the distance exceeds what is allowed.
+        outside_box: whether ξ, road or e is outside the conditions.
+        env_inside: whether e is inside its box.
     """
 
     state: ShieldState
     fiber: Fiber
-    flags: dict[str, Any]
+    nominal_state: PathState
+    distance: Scalar
+    bound_exceeded: Bool[Array, ""]
+    outside_box: Bool[Array, ""]
+    env_inside: Bool[Array, ""]
 
 
 class NominalModel(NamedTuple):
@@ -151,11 +159,9 @@ class NominalModel(NamedTuple):
                 offset=jnp.where(starts, self.start_error, before.offset),
             ),
             fiber=fiber,
-            flags={
-                "nominal_state": jnp.where(started, nominal, jnp.nan),
-                "nominal_distance": jnp.where(compared, distance, jnp.nan),
-                "bound_exceeded": exceeded,
-                "outside_box": started & ~covered,
-                "env_inside": env_inside,
-            },
+            nominal_state=jnp.where(started, nominal, jnp.nan),
+            distance=jnp.where(compared, distance, jnp.nan),
+            bound_exceeded=exceeded,
+            outside_box=started & ~covered,
+            env_inside=env_inside,
         )

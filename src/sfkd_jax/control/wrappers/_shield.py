@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control._finite import all_finite
@@ -27,11 +27,11 @@ from sfkd_jax.control.wrappers._nominal import Comparison, NominalModel, ShieldS
 from sfkd_jax.control.wrappers._rolling import RollingCorridor
 from sfkd_jax.control.wrappers._safety_filter import FilterResult, safety_filter
 from sfkd_jax.geometry import HEADING, PATH_SPEED, PathState
+from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
 from sfkd_jax.types import (
     Control,
     Controller,
-    ControllerInfo,
     Environment,
     Key,
     Model,
@@ -58,23 +58,6 @@ class Decision(NamedTuple):
     braking: Bool[Array, ""]
 
 
-class Claim(NamedTuple):
-    """What may be claimed of a step.
-
-    Attributes:
-        applies: whether nothing in this step voids the certificate.
-        holds: whether the certificate applies and the nominal model stays inside.
-        rolls: whether the corridor goes on from its last value, below the slowest speed
-            of the conditions.
-        corridor: bound of |e_y| [m]; NaN where none holds.
-    """
-
-    applies: Bool[Array, ""]
-    holds: Bool[Array, ""]
-    rolls: Bool[Array, ""]
-    corridor: Scalar
-
-
 @dataclass(frozen=True, kw_only=True)
 class Shield(Stateful):
     """A wrapper around a planner that keeps a nominal model in its corridor.
@@ -90,12 +73,12 @@ class Shield(Stateful):
     `Gate`, which replaces what is not finite.
 
     - If the planner is not healthy, or its control is not finite, the law drives alone.
-    - Outside the conditions (`outside_box`) the certificate does not apply, and the law
+    - Outside the conditions (OUTSIDE_BOX) the certificate does not apply, and the law
       drives alone, back to the path.
-    - A drive that is below the law's by more than the perturbation (`braking`) passes
+    - A drive that is below the law's by more than the perturbation (BRAKING) passes
       everywhere, while the steering stays limited. The certificate does not apply.
-    - If |e_y − ê_y| > tube + offset + noise_allowance (`bound_exceeded`), the bound
-      does not hold for this vehicle.
+    - If |e_y − ê_y| > tube + offset + noise_allowance (BOUND_EXCEEDED), the bound does
+      not hold for this vehicle.
     - After any of these, and after steps that the gate did not measure or trust, the
       nominal model starts anew at the next measurement, with `offset` = start_error for
       the noise in that measurement.
@@ -105,21 +88,8 @@ class Shield(Stateful):
     - Before the first measurement there is no nominal model. The control of the wrapped
       controller passes, clipped to its limits, or is 0 if it is not finite.
 
-    `info` gains these entries:
-
-        margin            of `safety_filter` [m]; NaN without a nominal model
-        intervention      1 − s, the removed share of the request after it was clipped
-                          to the law's perturbation; 0 if the request passed, 1 outside
-                          the conditions or if the car is steered back
-        perturbation      ν'
-        nominal_state     ξ of the nominal model
-        nominal_distance  |e_y − ê_y| [m]; NaN without a comparison
-        feasible, bound_exceeded, outside_box, braking, env_inside
-        corridor          the bound of |e_y| at this step [m]; NaN where none holds
-        rolling           the part of `corridor` that `RollingCorridor` added [m]
-        shield_healthy    whether there is such a bound
-        healthy           whether the control is the plan of a healthy planner inside
-                          the corridor
+    `info` gains `shield`, see `ShieldInfo`, and the `claim` of the step: the bound of
+    |e_y|, or the `Reason` why none holds.
 
     Attributes:
         inner: any controller along a path; its control is u.
@@ -138,7 +108,7 @@ class Shield(Stateful):
         rear: distance from the rear axle to the position of the vehicle [m], see
             `RollingCorridor`.
         claimed: whether `width` and `tube` are known of the vehicle itself. If they are
-            known only of a model of it, `corridor` is NaN.
+            known only of a model of it, nothing is claimed (NOT_CALIBRATED).
 
     Raises:
         ValueError: the model is not in path coordinates, or a setting is out of range.
@@ -204,43 +174,43 @@ class Shield(Stateful):
         compared = self._nominal.compare(
             params, state._replace(inner=inner), coordinates, env, preview, law_control
         )
-        healthy = info.get("healthy", True)
+        info = reported(info)
         decision = self._decide(
-            compared, planned, healthy, law_control, coordinates, road
+            compared, planned, info.plan.healthy, law_control, coordinates, road
         )
-        claim = self._claim(compared, decision, coordinates, preview)
         now = compared.state
+        reason = self._reason(compared, decision, preview)
+        claim = self._claim(reason, now, coordinates, preview)
         passed = decision.passed
-        removed = jnp.where(compared.flags["outside_box"], 1.0, 1.0 - passed.scale)
-        intervention = jnp.where(now.started & decision.changed, removed, 0.0)
-        corridor = claim.corridor
-        if not self.claimed:
-            corridor = jnp.full_like(corridor, jnp.nan)
-        added = claim.corridor - self.width - self.tube
-        report: Any = {
-            **info,
-            **compared.flags,
-            "margin": jnp.where(now.started, passed.margin, jnp.nan),
-            "intervention": intervention,
-            "perturbation": passed.nu,
-            "braking": decision.braking,
-            "feasible": now.started & passed.feasible,
-            "corridor": corridor,
-            "rolling": jnp.where(claim.rolls, added, 0.0),
-            "shield_healthy": jnp.isfinite(corridor),
-            "healthy": decision.usable & claim.holds & (intervention == 0.0),
-        }
-        # A latent that is not finite would stay so: the nominal model starts anew.
-        running = claim.applies & all_finite(passed.latent)
+        removed = jnp.where(compared.outside_box, 1.0, 1.0 - passed.scale)
+        rolls = claim.reason == Reason.ROLLING
+        added = claim.bound - self.width - self.tube
+        info = info._replace(
+            plan=info.plan._replace(healthy=decision.usable),
+            claim=claim,
+            env_inside=compared.env_inside,
+            shield=ShieldInfo(
+                margin=jnp.where(now.started, passed.margin, jnp.nan),
+                intervention=jnp.where(now.started & decision.changed, removed, 0.0),
+                perturbation=passed.nu,
+                nominal_state=compared.nominal_state,
+                nominal_distance=compared.distance,
+                rolling=jnp.where(rolls, added, 0.0),
+            ),
+        )
+        # After a step without the certificate the nominal model starts anew, and so it
+        # does where its latent is not finite, since it would stay so.
+        covered = (reason == Reason.CERTIFIED) | (reason == Reason.INFEASIBLE)
+        running = covered & all_finite(passed.latent)
         latent = jax.tree.map(partial(jnp.where, running), passed.latent, now.latent)
         growth = self._rolling.growth(coordinates, road[0], turn.state[HEADING])
         after = now._replace(
             latent=latent,
             started=running,
             offset=self.decay * now.offset,
-            rolling=claim.corridor + growth,
+            rolling=claim.bound + growth,
         )
-        return decision.control, after, report
+        return decision.control, after, info
 
     @property
     def _nominal(self) -> NominalModel:
@@ -274,7 +244,7 @@ class Shield(Stateful):
         planned = self._within_limits(jnp.where(all_finite(planned), planned, 0.0))
         request = jnp.where(usable, self._request(planned, law_control), 0.0)
         # Outside the conditions no request is admissible: the law drives alone.
-        limit = jnp.where(compared.flags["outside_box"], 0.0, self.law.perturbation)
+        limit = jnp.where(compared.outside_box, 0.0, self.law.perturbation)
         passed = safety_filter(
             self.model,
             compared.fiber,
@@ -296,30 +266,49 @@ class Shield(Stateful):
         control = jnp.stack([control[0], drive])
         return Decision(control, usable, passed, changed, braking)
 
+    def _reason(
+        self, compared: Comparison, decision: Decision, preview: Preview
+    ) -> Int[Array, ""]:
+        """Return what speaks against a claim in this step; CERTIFIED if nothing does.
+
+        Whether the nominal model stays inside comes last.
+        """
+        return first(
+            preview.reason,
+            (~jnp.all(preview.measured), Reason.NOT_MEASURED),
+            (~compared.state.started, Reason.NOT_STARTED),
+            (compared.outside_box | ~compared.env_inside, Reason.OUTSIDE_BOX),
+            (compared.bound_exceeded, Reason.BOUND_EXCEEDED),
+            (decision.braking, Reason.BRAKING),
+            (~decision.passed.feasible, Reason.INFEASIBLE),
+        )
+
     def _claim(
         self,
-        compared: Comparison,
-        decision: Decision,
+        reason: Int[Array, ""],
+        before: ShieldState,
         coordinates: PathState,
         preview: Preview,
     ) -> Claim:
-        """Return what may be claimed of this step."""
-        now = compared.state
-        flags = compared.flags
-        measured = preview.trusted & jnp.all(preview.measured)
-        applies = now.started & ~(flags["outside_box"] | flags["bound_exceeded"])
-        applies &= ~decision.braking & flags["env_inside"] & measured
-        feasible = now.started & decision.passed.feasible
-        holds = applies & feasible
-        certified = self.width + self.tube + now.offset
-        certified = jnp.where(holds, certified, jnp.nan)
+        """Return what is claimed of this step.
+
+        Args:
+            reason: from `_reason`.
+            before: the nominal model at this step.
+            coordinates: measured ξ.
+            preview: of the road.
+        """
+        holds = reason == Reason.CERTIFIED
+        if not self.claimed:
+            return Claim(reason=jnp.where(holds, Reason.NOT_CALIBRATED, reason))
+        certified = self.width + self.tube + before.offset
+        measured = (preview.reason == Reason.CERTIFIED) & jnp.all(preview.measured)
         slow = self._rolling.applies(coordinates, self._road(preview)[0])
-        rolls = slow & measured & ~holds
+        rolls = slow & measured & ~holds & jnp.isfinite(before.rolling)
+        bound = jnp.where(holds, certified, jnp.nan)
         return Claim(
-            applies=applies,
-            holds=holds,
-            rolls=rolls,
-            corridor=jnp.where(rolls, now.rolling, certified),
+            bound=jnp.where(rolls, before.rolling, bound),
+            reason=jnp.where(rolls, Reason.ROLLING, reason),
         )
 
     def _within_limits(self, control: Control) -> Control:
