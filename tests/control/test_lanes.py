@@ -392,7 +392,7 @@ def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
 
     info = jax.eval_shape(told, road)
     assert info.lane.reference.shape == (policy.interface["horizon"], 4)
-    assert {"clearance", "offset", "admissible", "stopping", "corridor"} <= set(info)
+    assert {leaf.shape for leaf in info.lane[1:]} == {info.claim.bound.shape} == {()}
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
         jax.eval_shape(told, road._replace(left=jnp.ones(3)))
     with pytest.raises(ValueError, match="no certified corridor"):
