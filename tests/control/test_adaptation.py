@@ -91,7 +91,7 @@ def driver(**settings):
     env = jnp.asarray([0.7, 0.0])
 
     @jit
-    def run(seed, force, steering, noise, fault):
+    def run(seed, force, steering, noise, fault, scores):
         pushed = LOOP.split_force(env, force)[0]
 
         def step(carry, inputs):
@@ -106,18 +106,31 @@ def driver(**settings):
             return (state, memory, seen), (info, memory.inner.inner.belief)
 
         start = jnp.asarray([0.0, 0.0, 0.0, 10.0])
-        carry = (start, controller.init(jax.random.key(0)), start)
+        memory = controller.init(jax.random.key(0))
+        gate = memory.inner
+        belief = gate.inner.belief._replace(scores=scores)
+        gate = gate._replace(inner=gate.inner._replace(belief=belief))
+        carry = (start, memory._replace(inner=gate), start)
         keys = jax.random.split(jax.random.key(seed), STEPS)
         return jax.lax.scan(step, carry, (jnp.arange(float(STEPS)), keys))[1]
 
     return run
 
 
-def drive(seed=0, force=0.0, steering=0.0, noise=0.0, fault="none", **settings):
-    run = driver(**settings)
-    return jax.tree.map(
-        np.asarray, run(seed, force, steering, noise, list(FAULTS).index(fault))
-    )
+def drive(
+    seed=0,
+    force=0.0,
+    steering=0.0,
+    noise=0.0,
+    fault="none",
+    scores=(0.0, 0.0),
+    **settings,
+):
+    """One drive; without settings, causes are not shrunk and all drives are one program."""
+    run = driver(**(settings or {"shrinkage": 0.0}))
+    number = list(FAULTS).index(fault)
+    made = run(seed, force, steering, noise, number, jnp.asarray(scores))
+    return jax.tree.map(np.asarray, made)
 
 
 def test_an_offset_shifts_a_step_and_nothing_else():
@@ -155,7 +168,7 @@ def test_the_certificate_of_the_model_holds_for_the_adapted_one():
 
 def test_a_constant_side_force_is_found():
     force = -0.6
-    info, _ = drive(force=force, shrinkage=0.0)
+    info, _ = drive(force=force)
     causes = info.adaptation.causes[-20:]
     np.testing.assert_allclose(causes[:, estimator.FORCE], force, atol=0.05)
     np.testing.assert_allclose(causes[:, estimator.STEERING], 0.0, atol=0.002)
@@ -175,7 +188,7 @@ def test_the_true_cause_lies_within_the_reported_spread():
     inside = []
     for seed in range(3):
         settings = {"force": truth[0], "steering": truth[1], "noise": 1.0}
-        info, _ = drive(seed, shrinkage=0.0, **settings)
+        info, _ = drive(seed, **settings)
         gap = np.abs(info.adaptation.causes[30:, :2] - truth)
         inside.append(gap <= 3.0 * info.adaptation.causes_std[30:, :2] + 1e-3)
     assert np.mean(inside) > 0.95
@@ -191,7 +204,7 @@ def test_wind_is_estimated_if_it_is_not_measured():
 @pytest.mark.parametrize("fault", ["jump", "freeze", "lose", "overflow"])
 def test_a_sensor_fault_is_not_learned_as_a_cause(fault):
     """At the fault the causes move by less than a tenth of what was learned."""
-    settings = {"force": 0.5, "steering": 0.01, "noise": 1.0, "shrinkage": 0.0}
+    settings = {"force": 0.5, "steering": 0.01, "noise": 1.0}
     info, belief = drive(fault=fault, **settings)
     assert info.adaptation.rejected[60]
     change = np.abs(np.diff(info.adaptation.causes[58:66, :2], axis=0)).max(axis=0)
@@ -209,26 +222,29 @@ def test_hostile_measurements_leave_finite_bounded_estimates():
     np.testing.assert_allclose(belief.bank.probabilities.sum(axis=-1), 1.0, atol=1e-4)
 
 
-INPUTS = (jnp.asarray([0.0, 0.0, 0.0, 10.0]), jnp.asarray([0.7, 0.0]), road(0.0))
-
-
-@cache
-def acting():
-    """A first state, and the step, compiled once."""
-    controller = adaptive()
-    return controller.init(jax.random.key(0)), jit(controller.act)
-
-
 def test_causes_that_predict_worse_than_none_are_not_used():
     """The scores of the last seconds decide."""
-    state, act = acting()
-    gate, scores = state.inner, jnp.asarray([2.0, 1.0])
-    belief = gate.inner.belief._replace(scores=scores)
-    gate = gate._replace(inner=gate.inner._replace(belief=belief))
-    state = state._replace(inner=gate)
-    _, _, info = act({}, state, *INPUTS)
-    assert not info.adaptation.adapting
-    np.testing.assert_array_equal(info.adaptation.causes, 0.0)
+    info, _ = drive(force=0.5, scores=(2e3, 1e3))
+    assert not info.adaptation.adapting[0]
+    np.testing.assert_array_equal(info.adaptation.causes[:5], 0.0)
+    better, _ = drive(force=0.5, scores=(1e3, 2e3))
+    assert better.adaptation.adapting[0]
+    assert np.any(better.adaptation.causes[:5])
+
+
+def test_a_force_that_could_be_noise_is_shrunk():
+    """f max(0, 1 - s var f / f²), and no other cause."""
+    options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW}
+    adaptation = control.Adaptation(**options)
+    belief = adaptation.init(jax.random.key(0)).belief
+    mean = jnp.asarray([0.0, 0.0, 10.0, 0.4, 0.01, 0.02, 0.03, 0.5])
+    for variance, left in ((0.2, 0.4 - 0.3 * 0.2 / 0.4), (0.6, 0.0)):
+        bank = belief.bank._replace(
+            means=jnp.tile(mean, (2, 1)),
+            covariances=jnp.tile(variance * jnp.eye(8), (2, 1, 1)),
+        )
+        causes = adaptation._estimator.causes(belief._replace(bank=bank), 0.3)
+        np.testing.assert_allclose(causes, [left, 0.01, 0.02, 0.03, 0.5], atol=1e-6)
 
 
 def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
