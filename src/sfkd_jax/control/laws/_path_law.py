@@ -108,10 +108,10 @@ class PathLaw(NamedTuple):
         return table.reshape(len(table), -1)[:, rows] @ weights
 
     def __call__(
-        self, coordinates: PathState, curvature: Scalar, speed: Scalar, env: Environment
+        self, xi: PathState, curvature: Scalar, speed: Scalar, env: Environment
     ) -> Control:
         """Return u, without any limit."""
-        return self.turn(curvature, speed, env).feedback(coordinates)
+        return self.turn(curvature, speed, env).feedback(xi)
 
 
 def _corners(

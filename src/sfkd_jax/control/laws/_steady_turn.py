@@ -71,14 +71,14 @@ class SteadyTurn(NamedTuple):
     gain: Float[Array, "*step control coordinate"]
     grip: Float[Array, "*step 2"]
 
-    def feedback(self, coordinates: PathState) -> Control:
+    def feedback(self, xi: PathState) -> Control:
         """Return the control of the whole plane, without the limits of the actuators.
 
         u = u* − K (ξ − ξ*)   near the path, elsewhere see `recovering`
         """
         # Errors are relative to ξ* and not to 0, because in side wind the heading of a
         # car on its path differs from that of the path.
-        errors = entrywise(jnp.subtract, coordinates, self.state)
+        errors = entrywise(jnp.subtract, xi, self.state)
         linear = entrywise(jnp.subtract, self.control, self.gain @ errors)
         return recovering(self, errors, linear)
 
@@ -91,12 +91,12 @@ class SteadyTurn(NamedTuple):
         """
         return jnp.abs(self.gain[0, HEADING])
 
-    def authority(self, coordinates: PathState) -> Scalar:
+    def authority(self, xi: PathState) -> Scalar:
         """Return the share of a planner's perturbation that acts, 1 near the path.
 
         A U-turn takes longer than the horizon of a planner, which would rather park.
         """
-        approach = course(self, coordinates - self.state)
+        approach = course(self, xi - self.state)
         return 1.0 - approach.far * approach.astray
 
 

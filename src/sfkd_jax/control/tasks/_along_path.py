@@ -208,7 +208,7 @@ class FollowingLaw(LawTask):
     def prepare(
         self,
         params: Params,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
         previous: PlanningStart,
@@ -220,11 +220,11 @@ class FollowingLaw(LawTask):
         )
         first_turn = jax.tree.map(lambda leaf: leaf[0], turns)
         low, high = self.box()
-        law_control = jnp.clip(first_turn.feedback(coordinates), low, high)
+        law_control = jnp.clip(first_turn.feedback(xi), low, high)
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
-        latent = self.model.encode(fiber, path_state(coordinates))
-        start = Sample(latent, coordinates, before)
+        latent = self.model.encode(fiber, path_state(xi))
+        start = Sample(latent, xi, before)
         fibers = None
         if self.model.on_road is not None:
             fibers = jax.vmap(partial(self.model.on_road, fiber))(preview.road)
@@ -249,12 +249,12 @@ class FollowingLaw(LawTask):
         inputs = jnp.concatenate([effective, target.road])
         road_fiber = fiber if target.fiber is None else target.fiber
         latent = self.model.step(road_fiber, before.latent, inputs)
-        coordinates = self.model.decode(fiber, latent)[BODY]
+        xi = self.model.decode(fiber, latent)[BODY]
         return StepResult(
-            sample=Sample(latent, coordinates, control),
+            sample=Sample(latent, xi, control),
             control=control,
             perturbation=effective,
-            state=coordinates,
+            state=xi,
         )
 
     def errors(
@@ -269,7 +269,7 @@ class FollowingLaw(LawTask):
         return errors_of(before.state), errors_of(after.state), speed
 
 
-def check_preview(coordinates: Any, env: Any, preview: Any, horizon: int) -> None:
+def check_preview(xi: Any, env: Any, preview: Any, horizon: int) -> None:
     """Raise a ValueError if there is no preview of this horizon."""
     if not isinstance(preview, Preview):
         raise ValueError(

@@ -200,7 +200,7 @@ class Adaptation(Stateful):
         self,
         params: Params,
         state: AdaptiveState,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
     ) -> tuple[Control, AdaptiveState, ControllerInfo]:
@@ -208,14 +208,14 @@ class Adaptation(Stateful):
         estimator = self._estimator
         before = state.belief
         loop = estimator.loop
-        size = coordinates.shape[0]
+        size = xi.shape[0]
         params = fold(self.model, params)
         env = self._inside(env)
         road = preview.road[0]
         # Nothing is learned from a measurement that the gate did not believe, nor at
         # another rate.
         usable = jnp.all(preview.measured) & preview.on_time
-        belief, rejected = estimator.follow(params, before, coordinates, usable)
+        belief, rejected = estimator.follow(params, before, xi, usable)
         adapting = belief.scores[0] <= TOLERANCE * belief.scores[1]
         # Causes that predict worse than none are not used, unless e depends on them.
         shrinkage = 0.0 if self.estimate_env else self.shrinkage
@@ -228,9 +228,7 @@ class Adaptation(Stateful):
         inside, excess = loop.split_force(env, side_force(causes, road))
         estimate = belief.bank.mean()[:size]
         offset = _compensation(loop, params, inside, road, estimate, excess)
-        control, inner, info = self.inner.act(
-            offset, state.inner, coordinates, inside, preview
-        )
+        control, inner, info = self.inner.act(offset, state.inner, xi, inside, preview)
         control = control + offset.inputs[:2] - input_error(causes, road)
         control = jnp.clip(
             control, jnp.asarray(self.control_low), jnp.asarray(self.control_high)
@@ -295,7 +293,7 @@ def _compensation(
     params: Params,
     env: Environment,
     road: Float[Array, " 2"],
-    coordinates: PathState,
+    xi: PathState,
     excess: Scalar,
 ) -> Offset:
     """Return the model with a force beyond E and with the steering that balances it.
@@ -311,20 +309,20 @@ def _compensation(
         params: of the model.
         env: e, with the part of the force that lies inside E.
         road: κ [1/m] and v_ref [m/s].
-        coordinates: estimate of ξ.
+        xi: estimate of ξ.
         excess: part of the force beyond E, relative to the largest force in E.
     """
     model = loop.model
-    size = coordinates.shape[0]
+    size = xi.shape[0]
     fiber = model.fiber(params, env)
-    law_control = loop.law(coordinates, road[0], road[1], env)
+    law_control = loop.law(xi, road[0], road[1], env)
     applied = Applied(law_control, road, env)
-    shifted = excess * loop.force_slope(params, applied, coordinates)
+    shifted = excess * loop.force_slope(params, applied, xi)
 
     def advance(xi: PathState, nu: Control) -> PathState:
         return expected_coordinates(model, fiber, xi, nu, road)
 
-    A, B = jax.jacfwd(advance, (0, 1))(coordinates, jnp.zeros(2))
+    A, B = jax.jacfwd(advance, (0, 1))(xi, jnp.zeros(2))
     # The unknowns are steering and drive in place of e_y and v, which stay at 0.
     equations = jnp.eye(size) - A
     equations = equations.at[:, LATERAL].set(-B[:, 0]).at[:, PATH_SPEED].set(-B[:, 1])
@@ -332,5 +330,5 @@ def _compensation(
     # The model was not learned beyond what data and planners add to the law.
     largest = 2.0 * loop.law.perturbation[0]
     steering = jnp.clip(jnp.nan_to_num(steering), -largest, largest)
-    shift = (path_state(coordinates), path_state(shifted))
+    shift = (path_state(xi), path_state(shifted))
     return Offset(params, jnp.zeros(4).at[0].set(steering), shift)

@@ -63,14 +63,14 @@ class Inputs(NamedTuple):
     """The inputs of a step, with what is not finite replaced.
 
     Attributes:
-        coordinates: observed ξ; NaN where it is not known.
+        xi: observed ξ; NaN where it is not known.
         env: finite e.
         preview: with a finite road.
         periods: sampling periods since the last call.
         env_known: whether e was finite, or is not read.
     """
 
-    coordinates: PathState
+    xi: PathState
     env: Environment
     preview: Preview
     periods: Scalar
@@ -194,18 +194,16 @@ class Gate(Stateful):
         self,
         params: Params,
         state: GateState,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
     ) -> tuple[Control, GateState, ControllerInfo]:
         """Take one control step."""
-        check_preview(coordinates, env, preview, self.horizon)
-        inputs = self._replaced(state, coordinates, env, preview)
+        check_preview(xi, env, preview, self.horizon)
+        inputs = self._replaced(state, xi, env, preview)
         preview = inputs.preview
-        believed = self._plausibility.judge(
-            state, inputs.coordinates, preview, inputs.periods
-        )
-        xi, measured, lost, _ = believed
+        believed = self._plausibility.judge(state, inputs.xi, preview, inputs.periods)
+        measured = believed.measured
         tested = self._tested(state, inputs, measured)
         reason = first(
             inputs.reason,
@@ -213,17 +211,17 @@ class Gate(Stateful):
             (tested.alarm, Reason.ALARM),
             (believed.state.doubt > 0, Reason.TRIAL),
         )
-        road = self._slowed(preview.road, xi[PATH_SPEED], lost)
+        road = self._slowed(preview.road, believed.xi[PATH_SPEED], believed.lost)
         shown = preview._replace(
             road=road, along=believed.state.along, measured=measured, reason=reason
         )
         control, inner, info = self.inner.act(
-            params, state.inner, xi, inputs.env, shown
+            params, state.inner, believed.xi, inputs.env, shown
         )
         expected = self._expect(
             params, inputs, believed, road, control, info, tested.state
         )
-        innovation = difference(inputs.coordinates, state.expected)
+        innovation = difference(inputs.xi, state.expected)
         info = info._replace(
             claim=info.claim.under(reason),
             env_inside=info.env_inside & inputs.env_known,
@@ -271,7 +269,7 @@ class Gate(Stateful):
     def _replaced(
         self,
         state: GateState,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
     ) -> Inputs:
@@ -283,7 +281,7 @@ class Gate(Stateful):
         on_time = jnp.abs(periods - 1.0) < 1e-3
         return Inputs(
             # Without the road a position is beside nothing.
-            coordinates=jnp.where(readable, coordinates, jnp.nan),
+            xi=jnp.where(readable, xi, jnp.nan),
             env=jnp.where(all_finite(env), env, state.env),
             preview=preview._replace(
                 road=jnp.where(readable, preview.road, moved_on), on_time=on_time
@@ -299,7 +297,7 @@ class Gate(Stateful):
         if self.test is None or state.test is None:
             return Tested(None, jnp.asarray(jnp.nan), jnp.asarray(False))
         used = measured & jnp.all(measured) & inputs.preview.on_time
-        after, statistic = self.test.update(state.test, inputs.coordinates, used)
+        after, statistic = self.test.update(state.test, inputs.xi, used)
         return Tested(after, statistic, after.alarm)
 
     def _expect(

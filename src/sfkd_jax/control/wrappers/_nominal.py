@@ -92,12 +92,12 @@ class NominalModel(NamedTuple):
     noise_allowance: float
     start_error: float
 
-    def zeros(self, key: Key, coordinates: int, environment: int) -> Latent:
+    def zeros(self, key: Key, size: int, environment: int) -> Latent:
         """Return a latent of zeros, for ξ and e with these numbers of entries."""
 
         def encode(params: Params) -> Latent:
             fiber = self.model.fiber(params, jnp.zeros(environment))
-            return self.model.encode(fiber, path_state(jnp.zeros(coordinates)))
+            return self.model.encode(fiber, path_state(jnp.zeros(size)))
 
         # Only shapes are evaluated.
         latent = jax.eval_shape(encode, jax.eval_shape(self.model.init, key))
@@ -107,7 +107,7 @@ class NominalModel(NamedTuple):
         self,
         params: Params,
         before: ShieldState,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
         law_control: Control,
@@ -117,7 +117,7 @@ class NominalModel(NamedTuple):
         Args:
             params: of the model.
             before: state after the last step.
-            coordinates: measured ξ.
+            xi: measured ξ.
             env: measured e.
             preview: of the road, with what the gate says about the measurement.
             law_control: of the law at ξ; the model does not start where it is not
@@ -136,10 +136,10 @@ class NominalModel(NamedTuple):
             return model.transport(old, fiber, before.latent)
 
         latent = jax.lax.cond(jnp.all(inside == before.env), unchanged, transported)
-        anchor = model.encode(fiber, path_state(coordinates))
+        anchor = model.encode(fiber, path_state(xi))
         readable = all_finite((anchor, law_control))
         compared = before.started & preview.measured[LATERAL]
-        distance = jnp.abs(coordinates - model.decode(fiber, latent)[BODY])[LATERAL]
+        distance = jnp.abs(xi - model.decode(fiber, latent)[BODY])[LATERAL]
         allowed = self.tube + self.noise_allowance + before.offset
         # Written so that a distance of NaN exceeds the bound.
         exceeded = compared & ~(distance <= allowed)
@@ -149,7 +149,7 @@ class NominalModel(NamedTuple):
         latent = jax.tree.map(partial(jnp.where, starts), anchor, latent)
         started = readable & all_finite(latent)
         env_inside = jnp.all(inside == env)
-        covered = self.conditions.hold(coordinates, preview.road[0]) & env_inside
+        covered = self.conditions.hold(xi, preview.road[0]) & env_inside
         nominal = model.decode(fiber, latent)[BODY]
         return Comparison(
             state=before._replace(

@@ -116,7 +116,7 @@ class Plausibility:
     def judge(
         self,
         state: GateState,
-        coordinates: PathState,
+        observed: PathState,
         preview: Preview,
         periods: Scalar,
     ) -> Believed:
@@ -124,24 +124,24 @@ class Plausibility:
 
         Args:
             state: of the gate after the last step.
-            coordinates: observed ξ.
+            observed: observed ξ.
             preview: of the road, with the place of the observation along the path.
             periods: sampling periods since the last call.
         """
         expected = state.expected
         compared = all_finite(expected)
-        innovation = difference(coordinates, expected)
+        innovation = difference(observed, expected)
         limit = self._limit(state, periods, preview.on_time)
         grown = limit * (1.0 + self.growth * state.missing)
         plausible = jnp.abs(innovation) <= grown
         moving = jnp.abs(expected[PATH_SPEED]) > MOVING
-        seen = jnp.isfinite(coordinates) & ~(preview.repeated & moving)
+        seen = jnp.isfinite(observed) & ~(preview.repeated & moving)
 
         # The path goes on under the vehicle: an observation that is suddenly ahead or
         # behind is of another time or place, in all of its entries.
         gap = preview.along - state.along
         shifted = (jnp.abs(gap) > self._reach(state, periods)) & moving
-        earlier = self._earlier(state, coordinates, preview.road[0, 0], gap)
+        earlier = self._earlier(state, observed, preview.road[0, 0], gap)
         late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
         late &= preview.on_time & shifted
         # Not for ever: the reference may have moved, and the car has stopped by then.
@@ -158,12 +158,12 @@ class Plausibility:
         # says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         missing = jnp.where(measured, 0, state.missing + 1)
-        xi = jnp.where(measured, coordinates, expected)
+        xi = jnp.where(measured, observed, expected)
         xi = jnp.where(late, expected + earlier.difference_now, xi)
 
         skew = self._skew(state.skew, innovation[HEADING], grown[HEADING])
         skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
-        heading = jnp.where(skewed, coordinates[HEADING] - skew, xi[HEADING])
+        heading = jnp.where(skewed, observed[HEADING] - skew, xi[HEADING])
         xi = put(xi, HEADING, heading)
 
         # A believed outlier starts anew; noise is averaged.

@@ -160,27 +160,25 @@ class Shield(Stateful):
         self,
         params: Params,
         state: ShieldState,
-        coordinates: PathState,
+        xi: PathState,
         env: Environment,
         preview: Preview,
     ) -> tuple[Control, ShieldState, ControllerInfo]:
         """Take one control step."""
-        planned, inner, info = self.inner.act(
-            params, state.inner, coordinates, env, preview
-        )
+        planned, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         road = self._road(preview)
         turn = self.law.turn(road[0, 0], road[0, 1], self.conditions.nearest(env))
-        law_control = turn.feedback(coordinates)
+        law_control = turn.feedback(xi)
         compared = self._nominal.compare(
-            params, state._replace(inner=inner), coordinates, env, preview, law_control
+            params, state._replace(inner=inner), xi, env, preview, law_control
         )
         info = reported(info)
         decision = self._decide(
-            compared, planned, info.plan.healthy, law_control, coordinates, road
+            compared, planned, info.plan.healthy, law_control, xi, road
         )
         now = compared.state
         reason = self._reason(compared, decision, preview)
-        claim = self._claim(reason, now, coordinates, preview)
+        claim = self._claim(reason, now, xi, preview)
         passed = decision.passed
         removed = jnp.where(compared.outside_box, 1.0, 1.0 - passed.scale)
         rolls = claim.reason == Reason.ROLLING
@@ -203,7 +201,7 @@ class Shield(Stateful):
         covered = (reason == Reason.CERTIFIED) | (reason == Reason.INFEASIBLE)
         running = covered & all_finite(passed.latent)
         latent = jax.tree.map(partial(jnp.where, running), passed.latent, now.latent)
-        growth = self._rolling.growth(coordinates, road[0], turn.state[HEADING])
+        growth = self._rolling.growth(xi, road[0], turn.state[HEADING])
         after = now._replace(
             latent=latent,
             started=running,
@@ -234,7 +232,7 @@ class Shield(Stateful):
         planned: Control,
         healthy: Bool[Array, ""] | bool,
         law_control: Control,
-        coordinates: PathState,
+        xi: PathState,
         road: Float[Array, "preview 2"],
     ) -> Decision:
         """Return the control to apply: that of the planner as far as it may pass."""
@@ -262,7 +260,7 @@ class Shield(Stateful):
         gentlest = self._within_limits(law_control) - self.law.perturbation
         braking = usable & now.started & (planned[1] < gentlest[1] - 1e-3)
         drive = jnp.where(braking, planned[1], control[1])
-        drive = self._held(now.started, drive, coordinates[PATH_SPEED], road[0, 1])
+        drive = self._held(now.started, drive, xi[PATH_SPEED], road[0, 1])
         control = jnp.stack([control[0], drive])
         return Decision(control, usable, passed, changed, braking)
 
@@ -287,7 +285,7 @@ class Shield(Stateful):
         self,
         reason: Int[Array, ""],
         before: ShieldState,
-        coordinates: PathState,
+        xi: PathState,
         preview: Preview,
     ) -> Claim:
         """Return what is claimed of this step.
@@ -295,7 +293,7 @@ class Shield(Stateful):
         Args:
             reason: from `_reason`.
             before: the nominal model at this step.
-            coordinates: measured ξ.
+            xi: measured ξ.
             preview: of the road.
         """
         holds = reason == Reason.CERTIFIED
@@ -303,7 +301,7 @@ class Shield(Stateful):
             return Claim(reason=jnp.where(holds, Reason.NOT_CALIBRATED, reason))
         certified = self.width + self.tube + before.offset
         measured = (preview.reason == Reason.CERTIFIED) & jnp.all(preview.measured)
-        slow = self._rolling.applies(coordinates, self._road(preview)[0])
+        slow = self._rolling.applies(xi, self._road(preview)[0])
         rolls = slow & measured & ~holds & jnp.isfinite(before.rolling)
         bound = jnp.where(holds, certified, jnp.nan)
         return Claim(
