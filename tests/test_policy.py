@@ -210,7 +210,7 @@ def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
     _, state, info = jax.eval_shape(own.act, trained.params, own.init(KEY), *inputs)
     assert jax.tree.structure(state) == jax.tree.structure(own.init(KEY))
     assert info.plan.states.shape == (20, 4)
-    lawful = control.requesting(scripted(jnp.zeros((1, 2))), 20, 3)
+    lawful = control.in_the_world(scripted(jnp.zeros((1, 2))))
     along = trained.guard(lawful, along_path=True)
     jax.eval_shape(along.act, trained.params, along.init(KEY), *inputs)
 

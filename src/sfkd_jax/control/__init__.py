@@ -38,8 +38,7 @@ from sfkd_jax.control.tasks._task import constrained as constrained
 from sfkd_jax.control.tasks._task import free_task as free_task
 from sfkd_jax.control.tasks._task import outside_boxes as outside_boxes
 from sfkd_jax.control.tasks._task import outside_circles as outside_circles
-from sfkd_jax.control.tasks._world_planner import behind as behind
-from sfkd_jax.control.tasks._world_planner import requesting as requesting
+from sfkd_jax.control.tasks._world_planner import in_the_world as in_the_world
 from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
 from sfkd_jax.control.wrappers._conditions import Box as Box
 from sfkd_jax.control.wrappers._conditions import Conditions as Conditions

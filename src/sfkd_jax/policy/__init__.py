@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import build, store
-from sfkd_jax.control import behind, requesting
+from sfkd_jax.control import in_the_world
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.policy._description import describe, interface_of
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
@@ -91,12 +91,9 @@ class Policy(TrainedModel):
         self._with_corridor()
         # Its settings are numbers, also where a program is traced when it is built.
         with jax.ensure_compile_time_eval():
-            if along_path:
-                return _entrance(self.around(planner=planner), self)
-            horizon = build.controller_horizon(self.settings["controller"])
-            coordinates = len(self.vehicle.state_names) - 1
-            shielded = self.around(planner=requesting(planner, horizon, coordinates))
-        return _entrance(behind(shielded), self)
+            if not along_path:
+                planner = in_the_world(planner)
+            return _entrance(self.around(planner=planner), self)
 
     def in_lane(
         self, *, car: tuple[float, float] | None = None, planner: str = "mppi"

@@ -41,7 +41,7 @@ from sfkd_jax.geometry import (
     path_coordinates,
     path_state,
 )
-from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first
+from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -66,6 +66,8 @@ class Preview(NamedTuple):
         along: distance along the path from the first point of the reference to the
             observed position [m]; behind a `Gate`, to the last position that was
             believed.
+        observation: in the world, as it came.
+        reference: in the world, as it came.
         repeated: whether the observation is bit for bit the last one, like that of a
             sensor that froze.
         measured: which entries of ξ are measured; behind a `Gate` the others are
@@ -77,6 +79,8 @@ class Preview(NamedTuple):
 
     road: Float[Array, "horizon 2"]
     along: Scalar
+    observation: State
+    reference: Reference
     repeated: Bool[Array, ""]
     measured: Bool[Array, " coordinate"]
     on_time: Bool[Array, ""]
@@ -125,19 +129,21 @@ class AlongReference(Stateful):
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
         """Take one control step."""
         precise = check_path(observation, env, reference, reference.shape[0])
-        reference, is_followable = followable(reference)
-        curvature = curvature_ahead(reference)
-        xi = path_coordinates(observation, reference[0], curvature[0])
-        road = jnp.stack([curvature, reference[:, 3]], axis=1)
+        points, is_followable = followable(reference)
+        curvature = curvature_ahead(points)
+        xi = path_coordinates(observation, points[0], curvature[0])
+        road = jnp.stack([curvature, points[:, 3]], axis=1)
         # κ can be finite where a position is not, because such points count as one.
         # A reference that cannot be trusted as a whole is NaN as a whole.
-        readable = all_finite(reference)
+        readable = all_finite(points)
         road = jnp.where(readable, road, jnp.nan)
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
         repeated = jnp.all(observation == state.observation)
         preview = Preview(
             road=road,
-            along=between(reference[0, POSE], observation[POSE])[0],
+            along=between(points[0, POSE], observation[POSE])[0],
+            observation=observation,
+            reference=reference,
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
@@ -150,8 +156,10 @@ class AlongReference(Stateful):
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         planned = info.plan.states
         if planned is not None:
-            states = jax.vmap(beside)(planned, reference)
-            info = info._replace(plan=info.plan._replace(states=states))
+            states = jax.vmap(beside)(planned, points)
+        else:
+            states = reported(info.planner).plan.states
+        info = info._replace(plan=info.plan._replace(states=states))
         measured = preview.measured if info.gate is None else info.gate.measured
         seen = jnp.where(measured, xi, jnp.nan)
         info = info._replace(
