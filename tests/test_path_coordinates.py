@@ -11,7 +11,8 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import plants
-from sfkd_jax.geometry import circle_errors, closed_loop, compose, is_valid, path_state
+from sfkd_jax.geometry import circle_errors, compose, is_valid, path_state
+from sfkd_jax.plants._along_path import step_with_law
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
 
@@ -68,7 +69,9 @@ def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
     size = len(plant.state_names)
     env = jnp.asarray([0.7, 3.0])
     inputs = jnp.asarray([0.004, 0.1, curvature, 9.0])
-    step = jax.jit(closed_loop(plant.step, law, plant.control_low, plant.control_high))
+    step = jax.jit(
+        step_with_law(plant.step, law, plant.control_low, plant.control_high)
+    )
     path = path_from_curvature(jnp.full(400, curvature), spacing=0.5)
     world = jnp.zeros(size).at[1].set(0.3).at[3].set(9.5)
     along = path_state(world[1:])

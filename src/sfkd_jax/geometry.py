@@ -319,32 +319,3 @@ def path_step(
         return jnp.concatenate([jnp.stack([lateral, heading]), after[BODY]])
 
     return along
-
-
-def closed_loop(
-    step: Step, law: PathFeedback, low: tuple[float, ...], high: tuple[float, ...]
-) -> Step:
-    """Return the step of a vehicle in closed loop with a law.
-
-    It maps (path state, w, e) to the path state one sampling period later:
-
-        ξ⁺ = F(ξ, clip(law(ξ; κ, v_ref, e) + ν); κ, e)
-
-    Args:
-        step: of the vehicle in the world frame, (x, u, e) -> x⁺.
-        law: (ξ, κ, v_ref, e) -> u.
-        low: lower limits of the vehicle's controls.
-        high: upper limits of the vehicle's controls.
-    """
-    along = path_step(step)
-    bottom = jnp.asarray(low)
-    top = jnp.asarray(high)
-
-    def closed(state: State, inputs: Control, env: Environment) -> State:
-        curvature = inputs[CURVATURE]
-        wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
-        # The actuator limits the sum, so the clip comes after the perturbation.
-        control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
-        return path_state(along(state[BODY], control, curvature, env))
-
-    return closed

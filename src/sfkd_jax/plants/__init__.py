@@ -1,5 +1,8 @@
 """Simulated vehicles as pure step functions."""
 
+from sfkd_jax.plants._along_path import along_path as along_path
+from sfkd_jax.plants._along_path import axes as axes
+from sfkd_jax.plants._along_path import path_states as path_states
 from sfkd_jax.plants._dynamic import dynamic as dynamic
 from sfkd_jax.plants._kinematic import kinematic as kinematic
 from sfkd_jax.plants._kinematic import kinematic_stiff as kinematic_stiff
@@ -14,10 +17,7 @@ from sfkd_jax.plants._variables import EnvironmentVariable as EnvironmentVariabl
 from sfkd_jax.plants._variables import Size as Size
 from sfkd_jax.plants._variables import StateVariable as StateVariable
 from sfkd_jax.plants._vehicle import Vehicle as Vehicle
-from sfkd_jax.plants._vehicle import along_path as along_path
-from sfkd_jax.plants._vehicle import axes as axes
 from sfkd_jax.plants._vehicle import equivalent_wind as equivalent_wind
-from sfkd_jax.plants._vehicle import path_states as path_states
 from sfkd_jax.plants._vehicle import rk4 as rk4
 from sfkd_jax.plants._vehicle import side_force as side_force
 from sfkd_jax.plants._vehicle import with_speed_loop as with_speed_loop
