@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from composing import settings
+from composing import run
 from helpers import last_line, run_command
 
 from sfkd_jax import demo, policy
@@ -41,6 +41,6 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
 
 def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match="controllers ship for ") as refusal:
-        demo.run(settings("vehicle.mass=900.0", f"root={tmp_path}"))
+        demo.main(run("vehicle.mass=900.0", f"root={tmp_path}"))
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []

@@ -138,7 +138,7 @@ COUNTED = """
         events[name] = events.get(name, 0) + 1
 
     jax.monitoring.register_event_listener(count)
-    hydra_command(train.run)()
+    hydra_command(train.main)()
     print(json.dumps({key: events.get(key, 0) for key in ("cache_hits", "cache_misses")}))
 """
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from composing import settings
+from composing import run, settings
 from helpers import last_line, run_command
 
 from sfkd_jax.experiment import command, comparing
-from sfkd_jax.experiment.runs import provenance
+from sfkd_jax.experiment.run_directory import provenance
 from sfkd_jax.settings import replace
 from sfkd_jax.store import write_json
 
@@ -91,15 +91,15 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    path, chosen = cells()[0].path(tmp_path), settings()
+    path, chosen = cells()[0].path(tmp_path), run()
     assert not comparing.is_done(path, chosen)
     made = comparing.settings_hash(chosen)
     path.parent.mkdir(parents=True)
     write_json(rows_file(path), {"row": {}, "made_with": made})
     assert comparing.is_done(path, chosen)
-    assert not comparing.is_done(path, settings("evaluation.episodes=9"))
-    assert not comparing.is_done(path, settings("environment.sensor.delay_s=0.5"))
-    assert not comparing.is_done(path, settings("training.steps=50"))
+    assert not comparing.is_done(path, run("evaluation.episodes=9"))
+    assert not comparing.is_done(path, run("environment.sensor.delay_s=0.5"))
+    assert not comparing.is_done(path, run("training.steps=50"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
     assert not comparing.is_done(path, chosen)
 
@@ -134,7 +134,7 @@ def collected(tmp_path, entries, missing=(), changes=()):
     """System -> row of a comparison on S1; `changes` are of the settings of icode."""
 
     def compose(cell):
-        return settings(*(changes if cell.label == "icode" else ()))
+        return run(*(changes if cell.label == "icode" else ()))
 
     listed = []
     for label in [*entries, *missing]:
@@ -157,8 +157,8 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     for cell in wanted:
         if cell.label != "missing":
             entry = row(cell.label, LEVELS[cell.label], cell.seed)
-            keep(tmp_path, cell, entry, settings())
-    rows = comparing.collect_rows(wanted, tmp_path, lambda cell: settings())
+            keep(tmp_path, cell, entry, run())
+    rows = comparing.collect_rows(wanted, tmp_path, lambda cell: run())
     found = {entry["system"]: entry for entry in rows}
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
@@ -173,10 +173,10 @@ def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, 
     ]
     sources = (provenance(), provenance(), {"commit": "another"})
     for cell, source in zip(listed, sources, strict=True):
-        made = settings("seed=9") if cell.label == "icode" else settings()
+        made = run("seed=9") if cell.label == "icode" else run()
         entry = row(cell.label, 1.0, 0) | {"provenance": source}
         keep(tmp_path, cell, entry, made)
-    rows = comparing.collect_rows(listed, tmp_path, lambda cell: settings())
+    rows = comparing.collect_rows(listed, tmp_path, lambda cell: run())
     assert {entry["system"] for entry in rows} == {"sfkd", "nominal"}
     said = capsys.readouterr().err
     assert "1 cells were made by other settings: left out" in said
