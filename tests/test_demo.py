@@ -8,8 +8,8 @@ from helpers import last_line, run_command
 
 from sfkd_jax import demo, policy
 
-BODY = ("+experiment=s3_body", "controller=mppi_tiny")
-PATH = ("controller.mppi.num_samples=30",)
+BODY = ("+experiment=s3_body", "controller=mppi_tiny", "demo.episode_s=9.0")
+PATH = ("controller.mppi.num_samples=30", "optimized=false", "demo.episode_s=6.0")
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ PATH = ("controller.mppi.num_samples=30",)
 def test_the_demo_drives_without_training_and_draws_an_animation(
     tmp_path, system, options
 ):
-    done = run_command("demo", *options, "demo.episode_s=9.0", cwd=tmp_path)
+    done = run_command("demo", *options, cwd=tmp_path)
     document = last_line(done)
     assert (tmp_path / document["animation"]).read_bytes()[:6] == b"GIF89a"
     rows = {

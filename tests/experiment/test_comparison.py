@@ -1,13 +1,11 @@
 """The cells of a comparison: which there are, when they are done, what is collected."""
 
-import json
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from composing import run, settings
-from helpers import last_line, run_command
 
 from sfkd_jax.experiment import command, comparing
 from sfkd_jax.experiment.run_directory import provenance
@@ -205,37 +203,3 @@ def test_an_unfinished_comparison_marks_no_more_than_the_finished_one(tmp_path):
     assert beside["p"] == alone["p"] < 0.01
     assert alone["p_holm"] == pytest.approx(alone["p"])
     assert beside["p_holm"] == pytest.approx(10 * alone["p"])
-
-
-def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
-    small = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
-    asked = (
-        "+experiment=smoke",
-        "+comparison.rows.two='evaluation.systems=[nominal,oracle]'",
-        "+comparison.rows.wrong='training.step=3'",
-        "+comparison.rows.unknown='certification.mode=boxes'",
-        "name=table",
-        *small,
-    )
-    done = run_command("compare", *asked, cwd=tmp_path)
-    first = last_line(done)
-    document = json.loads((tmp_path / first["results"]).read_text())
-    rows = {entry["system"]: entry for entry in document["rows"]}
-    assert set(rows) == {"oracle", "sfkd"}
-    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
-    assert len(document["failed"]) == first["failed"] == 3
-    assert "row wrong: " in done.stderr
-    assert "row two: evaluation.systems must be one system" in done.stderr
-    assert "certification.mode" in done.stderr
-    stored = tmp_path / "runs/table/cells"
-    before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
-    (victim,) = (file for file in before if "oracle" in file.name)
-    victim.write_bytes(before[victim][:-9])
-    again = run_command("compare", *asked, cwd=tmp_path)
-    assert "training sfkd" not in again.stderr
-    after = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
-    remade, first_made = (json.loads(kept.pop(victim)) for kept in (after, before))
-    assert after == before
-    for document in (remade, first_made):
-        assert document["row"].pop("provenance")
-    assert remade == first_made
