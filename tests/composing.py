@@ -5,6 +5,7 @@ from functools import cache
 from hydra import compose, initialize_config_dir
 
 from sfkd_jax.experiment import command, schemas
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.store import plain
 
 
@@ -25,6 +26,11 @@ def composed(*overrides):
 def settings(*overrides):
     """The checked settings."""
     return command.settings_of(composed(*overrides))
+
+
+def run(*overrides):
+    """The run of the checked settings, as a command gets it."""
+    return Run.of(settings(*overrides))
 
 
 def plain_settings(*overrides):

@@ -67,7 +67,7 @@ THIRD_PARTY = {
     "build": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},
-    "experiment": COMMAND_LINE | {"threadpoolctl"},
+    "experiment": COMMAND_LINE | {"threadpoolctl", "yaml"},
 } | {command: COMMAND_LINE for command in COMMANDS}
 HEAVY = {
     *("hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib"),

@@ -3,13 +3,13 @@
 import json
 
 import pytest
-from composing import settings
+from composing import run
 from helpers import last_line, run_command
 
 from sfkd_jax import demo, policy
 
-BODY = ("+experiment=s3_body", "controller=mppi_tiny")
-PATH = ("controller.mppi.num_samples=30",)
+BODY = ("+experiment=s3_body", "controller=mppi_tiny", "demo.episode_s=9.0")
+PATH = ("controller.mppi.num_samples=30", "optimized=false", "demo.episode_s=6.0")
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ PATH = ("controller.mppi.num_samples=30",)
 def test_the_demo_drives_without_training_and_draws_an_animation(
     tmp_path, system, options
 ):
-    done = run_command("demo", *options, "demo.episode_s=9.0", cwd=tmp_path)
+    done = run_command("demo", *options, cwd=tmp_path)
     document = last_line(done)
     assert (tmp_path / document["animation"]).read_bytes()[:6] == b"GIF89a"
     rows = {
@@ -41,6 +41,6 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
 
 def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match="controllers ship for ") as refusal:
-        demo.run(settings("vehicle.mass=900.0", f"root={tmp_path}"))
+        demo.main(run("vehicle.mass=900.0", f"root={tmp_path}"))
     assert "\n" not in str(refusal.value)
     assert list(tmp_path.iterdir()) == []

@@ -167,8 +167,8 @@ def test_adaptation_refuses_an_exact_sensor():
 
 def test_sensors_are_those_of_the_vehicle_unless_the_settings_say_otherwise():
     plant = electric()
-    assert settings().sensors(plant) == plant.sensor_noise
+    assert settings().evaluation.sensors(plant) == plant.sensor_noise
     coarse = settings("+evaluation.observation_noise.charge=0.5")
-    assert coarse.sensors(plant)[-2:] == (0.001, 0.5)
+    assert coarse.evaluation.sensors(plant)[-2:] == (0.001, 0.5)
     assert plant.sensor_noise == (0.015, 0.015, 0.002, 0.03, 0.02, 0.002, 0.001, 0.01)
     assert [one.name for one in plant.states if one.is_angle] == ["yaw", "steering"]

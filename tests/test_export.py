@@ -25,7 +25,6 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 import sfkd_jax
 from sfkd_jax import build, certification, policy, store
 from sfkd_jax import export as exporting
-from sfkd_jax.experiment import runs
 from sfkd_jax.export import __main__ as export
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
@@ -48,22 +47,22 @@ BOXES = {
 HEAVY = {"sfkd_jax", "flax", "hydra", "optax", "jaxtyping", "matplotlib", "iree"}
 
 
-def settings(root, *overrides):
-    return composing.settings(*SMALL, f"root={root}", *overrides)
+def run(root, *overrides):
+    return composing.run(*SMALL, f"root={root}", *overrides)
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """A certified run with weights as they were drawn; what the command wrote and printed."""
-    requested = settings(tmp_path_factory.mktemp("export") / "runs")
-    plant = build.build_vehicle(requested.vehicle)
-    params = jit(build.build_model(requested.model, space(), plant).init)(
+    requested = run(tmp_path_factory.mktemp("export") / "runs")
+    chosen = requested.settings
+    params = jit(build.build_model(chosen.model, space(), requested.plant).init)(
         jax.random.key(0)
     )
-    stored = store.plain(vars(requested) | {"space": space()._asdict()})
+    stored = store.plain(vars(chosen) | {"space": space()._asdict()})
     stored["dataset"] |= {"segments": 120, "shares": SHARES}
-    runs.claim(requested)
-    run_dir = requested.run_dir
+    requested.claim()
+    run_dir = requested.directory
     policy.save(
         run_dir / "policy.safetensors", params, stored, made_from={"dataset": "d" * 64}
     )
@@ -80,7 +79,7 @@ def exported(tmp_path_factory):
     certificate["weights_sha256"] = trained.weights_sha256
     certificate["policy_sha256"] = trained.sha256
     store.write_json(run_dir / "certificate.json", certificate)
-    return requested, export.run(requested)
+    return requested, export.main(requested)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,7 @@ def loaded(exported):
 @pytest.fixture
 def spoiled(exported, tmp_path):
     """The root of all runs, to spoil."""
-    return Path(shutil.copytree(exported[0].root, tmp_path / "runs"))
+    return Path(shutil.copytree(exported[0].settings.root, tmp_path / "runs"))
 
 
 @pytest.fixture
@@ -290,13 +289,13 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     assert act["outputs"][0]["name"] == "control"
     states = [leaf for leaf in act["outputs"] if leaf["name"].startswith("state.")]
     assert states == act["inputs"][:-3] == manifest["programs"]["init"]["outputs"]
-    weights = policy.restore(requested.run_dir).weights_sha256
+    weights = policy.restore(requested.directory).weights_sha256
     assert manifest["weights_sha256"] == weights
     certificate = hashlib.sha256((run_dir / "certificate.json").read_bytes())
     assert manifest["certificate_sha256"] == certificate.hexdigest()
     assert (manifest["sampling_period_s"], manifest["horizon"]) == (0.1, HORIZON)
     highest = tuple(control["high"] for control in manifest["controls"])
-    assert highest == build.build_vehicle(requested.vehicle).control_high
+    assert highest == requested.plant.control_high
     assert manifest["environment"]["low"] == list(ENV_LOW)
     assert loaded.certificate["boxes"] == BOXES
 
@@ -321,13 +320,13 @@ def test_an_export_does_not_contain_paths_of_this_machine(exported):
 def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
     spoiled, capsys
 ):
-    requested = settings(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
-    run_dir = requested.run_dir
+    requested = run(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
+    run_dir = requested.directory
     assert (run_dir / "export" / "certificate.json").exists()
     store.write_json(
         run_dir / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
     )
-    printed = export.run(requested)
+    printed = export.main(requested)
     assert "exported without a certificate" in capsys.readouterr().err
     manifest = json.loads(Path(printed["manifest"]).read_text())
     assert (manifest["horizon"], manifest["certificate_sha256"]) == (4, None)
@@ -432,7 +431,7 @@ def test_the_script_steps_a_controller_by_itself(exported):
 
 def test_a_run_without_a_policy_is_sent_to_train(tmp_path):
     with pytest.raises(store.ArtefactError, match="run train with the same options"):
-        export.run(settings(tmp_path))
+        export.main(run(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sfkd_jax import evaluation, store
-from sfkd_jax.experiment import runs
+from sfkd_jax.experiment import run_directory
 from sfkd_jax.store import DirectoryLocked, locked
 
 ROW = {
@@ -40,7 +40,7 @@ def started(program, *arguments):
 
 def keep(run_dir, row, value=0.0):
     arrays = {"lateral": np.full((2, 40), float(value)), "dt": np.asarray(0.1)}
-    runs.write_results(run_dir, {}, [(row, arrays)], 0.0)
+    run_directory.write_results(run_dir, {}, [(row, arrays)], 0.0)
 
 
 # ---- the lock

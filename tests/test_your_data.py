@@ -9,13 +9,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from composing import settings
+from composing import run, settings
 from helpers import last_line, run_command
 
 import sfkd_jax
 from sfkd_jax import build, collect, evaluate, plants
-from sfkd_jax.experiment import data, identified, runs, stages
-from sfkd_jax.experiment.dataset_files import dataset_config
+from sfkd_jax.experiment import identified
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.store import ArtefactError
 
 sys.path.append(str(Path(__file__).parent / "data"))
@@ -99,43 +99,38 @@ def test_logs_are_stored_with_their_coverage_and_only_test_runs_are_held_out(
     logs, monkeypatch
 ):
     monkeypatch.chdir(logs.parent)
-    options = settings(*SMALL)
-    dataset, _ = data.ensure_dataset(options)
+    source = run(*SMALL).source
+    dataset = source.dataset
     assert [part.states.shape[1:] for part in dataset[:4]] == [(11, 5)] * 4
     assert sum(len(part.states) for part in dataset[:4]) == 8 * 12
-    held_out = data.held_out_parts(options, dataset)
-    assert set(held_out) == {"test"}
-    assert held_out["test"] is dataset.test
-    covered = json.loads(
-        (data.dataset_path(options).parent / "coverage.json").read_text()
-    )
+    assert set(source.held_out) == {"test"}
+    assert source.held_out["test"] is dataset.test
+    covered = json.loads((source.path.parent / "coverage.json").read_text())
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
 
 
 def test_what_logs_cannot_support_is_refused_before_a_run_is_begun(logs, monkeypatch):
     monkeypatch.chdir(logs.parent)
-    options = settings(*SMALL, "name=other", "certification.level=0.99")
+    chosen = run(*SMALL, "name=other", "certification.level=0.99")
     with pytest.raises(ValueError, match="12 calibration segments are too few for"):
-        stages.ensure_policy(options)
+        _ = chosen.policy
     with pytest.raises(
         ValueError,
         match=r"no column friction among .* or pass environment.source=none",
     ):
-        stages.ensure_policy(
-            settings(*SMALL, "environment.source=measured", "name=other")
-        )
+        _ = run(*SMALL, "environment.source=measured", "name=other").policy
     with pytest.raises(
         ValueError,
         match="vehicle=own is known from logs alone, so it cannot be simulated",
     ):
-        evaluate.run(settings(*SMALL, *FAST, "name=other"))
+        evaluate.main(run(*SMALL, *FAST, "name=other"))
     assert not (logs.parent / "runs" / "other").exists()
 
 
 def test_logs_that_moved_are_the_same_data_set_and_changed_ones_are_not(logs, tmp_path):
     def identity(folder):
-        return runs.identity(settings(*SMALL, f"dataset.path={folder}"))
+        return run(*SMALL, f"dataset.path={folder}").identity
 
     here = identity(logs)
     shutil.copytree(logs, tmp_path / "moved")
@@ -198,7 +193,7 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
     shutil.copytree(driven, moved)
     again = logged(moved, "vehicle.missing=drop")
     assert "fitted" not in capsys.readouterr().err
-    assert dataset_config(again) == dataset_config(chosen)
+    assert Run.of(again).source.config == Run.of(chosen).source.config
 
 
 @pytest.mark.parametrize(
@@ -235,7 +230,7 @@ def test_an_environment_in_another_unit_is_told_of_while_recording(under_policy)
 
 def collected(root, runs="recorded", level=0.8):
     words = ("name=car", f"root={root}", f"collect.path={root / runs}")
-    return collect.run(settings(*words, f"certification.level={level}"))
+    return collect.main(run(*words, f"certification.level={level}"))
 
 
 def test_runs_of_the_car_calibrate_its_corridor_again(under_policy, capsys):

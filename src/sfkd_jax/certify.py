@@ -11,21 +11,21 @@ from sfkd_jax import store
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import hydra_command
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Certify the policy of the run, which is trained if it is missing."""
-    path = settings.certificate_path
-    with store.locked(settings.run_dir):
-        trained = stages.ensure_policy(settings)
-        is_kept = path.exists() and not settings.certification.renew
+    path = run.certificate_path
+    with store.locked(run.directory):
+        trained = run.policy
+        is_kept = path.exists() and not run.settings.certification.renew
         if is_kept and store.read_json(path).get("policy_sha256") != trained.sha256:
             raise CertificateStale(
                 f"{path} is about other weights or settings; "
                 "certification.renew=true replaces it"
             )
-        document = stages.certify_policy(settings)
+        document = stages.certify_policy(run)
     if not document["valid"]:
         raise CertificationRefused(document["reason"])
     keys = ("valid", "alpha", "alpha_separate", "rho", "beta", "tightness", "seconds")
@@ -38,4 +38,4 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -16,22 +16,22 @@ from sfkd_jax.certification.corridor import (
 )
 from sfkd_jax.data import recorded_runs
 from sfkd_jax.experiment.command import hydra_command
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 
 COUNTS = (5, 10, 20)
 """The corridor of so many of the first runs is printed as well."""
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Write a certificate with the corridor of recorded runs beside that of the run."""
-    folder = settings.run_dir
-    level = settings.certification.level
+    folder = run.directory
+    level = run.settings.certification.level
     trained = policy.restore(folder)
     document, reason = policy.read_certificate(folder, trained)
     if document is None or trained.law is None or "corridor" not in document:
         reason = reason or "its certificate has no corridor"
         raise ValueError(f"{folder}: nothing to calibrate again, {reason}")
-    runs, contents = recorded_runs(settings.collect.path, trained)
+    runs, contents = recorded_runs(run.settings.collect.path, trained)
     count, steps = runs.controls.shape[:2]
     seconds = steps * trained.vehicle.dt
     check_count(count, level, "runs")
@@ -68,4 +68,4 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

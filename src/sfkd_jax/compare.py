@@ -8,17 +8,18 @@ from typing import Any
 from sfkd_jax import store
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.comparing import Comparison
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.report.run import write_results_page
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Evaluate all cells that are not done, then collect, compare and draw all rows.
 
     With `comparison.share` only this share of the rows is evaluated, and no row is
     collected.
     """
     began = time.perf_counter()
+    settings = run.settings
     table = Comparison(settings)
     evaluated = table.evaluate()
     if settings.comparison.share is not None:
@@ -45,4 +46,4 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.experiment import evaluating, runs
+from sfkd_jax.experiment import evaluating, run_directory
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.report.episodes import of_rows
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.tables import text_table
@@ -19,18 +20,19 @@ PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s")
 """Metrics of the table."""
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Simulate a shipped policy beside nominal and oracle; print a table, animate."""
     began = time.perf_counter()
+    settings = run.settings
     name = settings.vehicle.name
-    shipped = f"{name}_path" if settings.along_path else name
+    shipped = f"{name}_path" if run.source.along_path else name
     trained = _load(settings, shipped)
     protocol = replace(settings.evaluation, **vars(settings.demo))
     settings = replace(settings, name="demo", evaluation=protocol)
-    episodes = evaluating.make_episodes(settings)
+    run = Run(settings, run.source)
+    episodes = evaluating.make_episodes(run)
     home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
-    plant = build.build_vehicle(settings.vehicle)
-    references = build.reference_systems(plant, trained.law)
+    references = build.reference_systems(run.plant, trained.law)
     certificate = trained.certificate or {}
     systems = {
         trained.settings["model"]["system"]: build.System(
@@ -44,11 +46,13 @@ def run(settings: Settings) -> dict[str, Any]:
         "oracle": references["oracle"],
     }
     with store.locked(home):
-        driven = evaluating.drive(settings, systems, episodes)
+        driven = evaluating.drive(run, systems, episodes)
         seconds = time.perf_counter() - began
-        results = runs.write_results(home, store.plain(settings), driven, seconds)
+        results = run_directory.write_results(
+            home, store.plain(settings), driven, seconds
+        )
         # The last ones: those of an earlier demo with other settings come before.
-        rows = runs.read_results(home)[-len(driven) :]
+        rows = run_directory.read_results(home)[-len(driven) :]
         store.print_message(text_table(rows, *PRINTED))
         half_width = certificate.get("corridor", {}).get("corridor_m")
         path = home.with_name(f"{home.name}.gif")
@@ -89,4 +93,4 @@ def _load(settings: Settings, name: str) -> policy.Policy:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -7,17 +7,18 @@ from typing import Any
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Evaluate the systems of the run and add their rows to its results."""
-    if not settings.evaluation.systems:
+    systems = run.settings.evaluation.systems
+    if not systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
-    stages.check_settings(settings)
-    path = evaluate_run(settings, command=command_line("evaluate"))
-    return {"results": str(path), "rows": len(settings.evaluation.systems)}
+    stages.check_settings(run)
+    path = evaluate_run(run, command=command_line("evaluate"))
+    return {"results": str(path), "rows": len(systems)}
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

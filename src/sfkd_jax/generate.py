@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax.experiment import data
+from sfkd_jax.data import PARTS
 from sfkd_jax.experiment.command import hydra_command
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Make the data set, unless it is stored already."""
     began = time.perf_counter()
-    dataset, _ = data.ensure_dataset(settings)
+    dataset = run.source.dataset
     return {
-        "dataset": str(data.dataset_path(settings)),
-        "segments": sum(len(getattr(dataset, part).controls) for part in data.PARTS),
+        "dataset": str(run.source.path),
+        "segments": sum(len(getattr(dataset, part).controls) for part in PARTS),
         "seconds": time.perf_counter() - began,
     }
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -5,15 +5,15 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from sfkd_jax import build, store
+from sfkd_jax import store
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.report.run import write_report
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Make data, policy, certificate, closed-loop results and report of a run.
 
     A vehicle without a step function is not evaluated in closed loop. With
@@ -21,17 +21,18 @@ def run(settings: Settings) -> dict[str, Any]:
     needs it.
     """
     began = time.perf_counter()
-    stages.check_settings(settings)
-    with store.locked(settings.run_dir):
-        summary = _run_stages(settings)
+    stages.check_settings(run)
+    with store.locked(run.directory):
+        summary = _run_stages(run)
     summary["seconds"] = time.perf_counter() - began
     return summary
 
 
-def _run_stages(settings: Settings) -> dict[str, Any]:
+def _run_stages(run: Run) -> dict[str, Any]:
     """Run all stages in the run directory; return what was made, by name."""
-    run_dir = settings.run_dir
-    trained = stages.ensure_policy(settings)
+    settings = run.settings
+    run_dir = run.directory
+    trained = run.policy
     # A policy that exists is not written again, and `load` builds what it says.
     controller = store.plain(settings.controller)
     if store.differences(trained.settings["controller"], controller):
@@ -49,10 +50,10 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     }
     if not settings.evaluation.systems:
         return summary
-    certificate = stages.certify_policy(settings)
+    certificate = stages.certify_policy(run)
     results = None
-    if build.build_vehicle(settings.vehicle).simulated:
-        results = str(evaluate_run(settings, command=command_line("train")))
+    if run.plant.simulated:
+        results = str(evaluate_run(run, command=command_line("train")))
     else:
         store.print_message(
             "not driven: vehicle=own is known from logs alone; "
@@ -61,7 +62,7 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     with store.as_artefact_error(run_dir):
         pages = write_report(run_dir)
     store.print_message(f"report: {pages['report']}")
-    summary["certificate"] = str(settings.certificate_path)
+    summary["certificate"] = str(run.certificate_path)
     summary["results"] = results
     summary["report"] = pages["report"]
     summary["alpha"] = certificate.get("alpha")
@@ -69,4 +70,4 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

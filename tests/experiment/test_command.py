@@ -23,13 +23,14 @@ SCRIPT = """
         99: KeyboardInterrupt(),
     }
 
-    def run(settings):
-        if settings.seed in FAILS:
-            raise FAILS[settings.seed]
-        return {"objective": (settings.seed - 7.0) ** 2, "run": str(settings.run_dir)}
+    def main(run):
+        seed = run.settings.seed
+        if seed in FAILS:
+            raise FAILS[seed]
+        return {"objective": (seed - 7.0) ** 2, "run": str(run.directory)}
 
     if __name__ == "__main__":
-        hydra_command(run)()
+        hydra_command(main)()
 """
 
 

@@ -24,12 +24,9 @@ read_policy = partial(store.read_arrays, kind="policy")
 def smoke(tmp_path_factory):
     """One smoke run from nothing; tests that change it copy it first."""
     directory = tmp_path_factory.mktemp("run")
-    hidden = pytest.MonkeyPatch()
-    for name in [name for name in os.environ if "JAX_" in name]:
-        hidden.delenv(name)  # so that programs are kept below the root
-    done = run_command("train", "+experiment=smoke", cwd=directory)
-    hidden.undo()
-    return directory, last_line(done)
+    return directory, last_line(
+        run_command("train", "+experiment=smoke", cwd=directory)
+    )
 
 
 @pytest.fixture
@@ -60,8 +57,7 @@ def test_the_certificate_is_about_the_weights(smoke):
     assert 1.0 <= certificate["tightness"] <= 1.1
 
 
-def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied):
-    assert last_line(run_command("certify", "+experiment=smoke", cwd=copied))["valid"]
+def test_certify_exits_3_when_weights_changed_and_0_when_renewed(copied):
     file = copied / POLICY
     arrays, manifest = read_policy(file)
     changed = {name: array * np.float32(1.01) for name, array in arrays.items()}
@@ -70,7 +66,44 @@ def test_certify_exits_0_then_3_when_weights_changed_then_0_when_renewed(copied)
     stale = run_command("certify", "+experiment=smoke", cwd=copied, code=3)
     assert "other weights" in stale.stderr
     options = ("+experiment=smoke", "certification.renew=true")
-    assert last_line(run_command("certify", *options, cwd=copied))["alpha"] < 1.0
+    renewed = last_line(run_command("certify", *options, cwd=copied))
+    assert renewed["valid"]
+    assert renewed["alpha"] < 1.0
+
+
+def test_compare_drives_every_row_names_those_that_fail_and_goes_on(copied):
+    """The policy of a row is that of the smoke run, so that nothing is trained again."""
+    run = copied / "runs/table/kinematic/sfkd/sfkd/seed=0"
+    shutil.copytree(copied / "runs/smoke/sfkd/seed=0", run)
+    asked = (
+        "+experiment=smoke",
+        "+comparison.rows.two='evaluation.systems=[nominal,oracle]'",
+        "+comparison.rows.wrong='training.step=3'",
+        "+comparison.rows.unknown='certification.mode=boxes'",
+        "name=table",
+    )
+    done = run_command("compare", *asked, cwd=copied)
+    first = last_line(done)
+    document = json.loads((copied / first["results"]).read_text())
+    rows = {entry["system"]: entry for entry in document["rows"]}
+    assert set(rows) == {"oracle", "sfkd"}
+    assert "training sfkd" not in done.stderr
+    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
+    assert len(document["failed"]) == first["failed"] == 3
+    assert "row wrong: " in done.stderr
+    assert "row two: evaluation.systems must be one system" in done.stderr
+    assert "certification.mode" in done.stderr
+    stored = copied / "runs/table/cells"
+    before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
+    (victim,) = (file for file in before if "oracle" in file.name)
+    victim.write_bytes(before[victim][:-9])
+    run_command("compare", *asked, cwd=copied)
+    after = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
+    remade, first_made = (json.loads(kept.pop(victim)) for kept in (after, before))
+    assert after == before
+    for document in (remade, first_made):
+        assert document["row"].pop("provenance")
+    assert remade == first_made
 
 
 @pytest.mark.exhaustive
@@ -138,29 +171,32 @@ COUNTED = """
         events[name] = events.get(name, 0) + 1
 
     jax.monitoring.register_event_listener(count)
-    hydra_command(train.run)()
+    hydra_command(train.main)()
     print(json.dumps({key: events.get(key, 0) for key in ("cache_hits", "cache_misses")}))
 """
 
 
 @pytest.mark.exhaustive
-def test_the_same_command_again_trains_nothing_and_another_run_compiles_nothing(smoke):
-    """Programs are kept below the root, so a second training of a kind only runs."""
+def test_the_same_command_again_trains_nothing(smoke):
     directory, before = smoke
     weights = (directory / before["run"] / "policy.safetensors").read_bytes()
     again = last_line(run_command("train", "+experiment=smoke", cwd=directory))
     kept = directory / again["run"] / "policy.safetensors"
     assert kept.read_bytes() == weights
     assert again["open_loop_rmse_m"] == before["open_loop_rmse_m"]
+
+
+@pytest.mark.exhaustive
+def test_another_run_compiles_nothing(tmp_path):
+    """Programs are kept below the root, so a second training of a kind only runs."""
     hidden = {name: os.environ[name] for name in os.environ if "JAX_" not in name}
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(COUNTED), "+experiment=smoke", "seed=1"],
-        cwd=directory,
-        env=hidden,
-        capture_output=True,
-        text=True,
+    program = [sys.executable, "-c", textwrap.dedent(COUNTED), "+experiment=smoke"]
+    start = partial(
+        subprocess.run, cwd=tmp_path, env=hidden, capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr[-2000:]
+    for seed in ("seed=0", "seed=1"):
+        done = start([*program, seed])
+        assert done.returncode == 0, done.stderr[-2000:]
     counted = last_line(done)
     assert counted["cache_hits"] > 50
     assert counted["cache_misses"] <= 5

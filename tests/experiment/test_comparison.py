@@ -1,16 +1,14 @@
 """The cells of a comparison: which there are, when they are done, what is collected."""
 
-import json
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from composing import settings
-from helpers import last_line, run_command
+from composing import run, settings
 
 from sfkd_jax.experiment import command, comparing
-from sfkd_jax.experiment.runs import provenance
+from sfkd_jax.experiment.run_directory import provenance
 from sfkd_jax.settings import replace
 from sfkd_jax.store import write_json
 
@@ -91,15 +89,15 @@ def rows_file(path):
 
 
 def test_a_cell_is_done_only_with_its_own_settings_and_undamaged(tmp_path):
-    path, chosen = cells()[0].path(tmp_path), settings()
+    path, chosen = cells()[0].path(tmp_path), run()
     assert not comparing.is_done(path, chosen)
     made = comparing.settings_hash(chosen)
     path.parent.mkdir(parents=True)
     write_json(rows_file(path), {"row": {}, "made_with": made})
     assert comparing.is_done(path, chosen)
-    assert not comparing.is_done(path, settings("evaluation.episodes=9"))
-    assert not comparing.is_done(path, settings("environment.sensor.delay_s=0.5"))
-    assert not comparing.is_done(path, settings("training.steps=50"))
+    assert not comparing.is_done(path, run("evaluation.episodes=9"))
+    assert not comparing.is_done(path, run("environment.sensor.delay_s=0.5"))
+    assert not comparing.is_done(path, run("training.steps=50"))
     rows_file(path).write_bytes(rows_file(path).read_bytes()[:-5])
     assert not comparing.is_done(path, chosen)
 
@@ -134,7 +132,7 @@ def collected(tmp_path, entries, missing=(), changes=()):
     """System -> row of a comparison on S1; `changes` are of the settings of icode."""
 
     def compose(cell):
-        return settings(*(changes if cell.label == "icode" else ()))
+        return run(*(changes if cell.label == "icode" else ()))
 
     listed = []
     for label in [*entries, *missing]:
@@ -157,8 +155,8 @@ def test_collecting_pools_the_seeds_and_compares_what_is_there(tmp_path, seeds):
     for cell in wanted:
         if cell.label != "missing":
             entry = row(cell.label, LEVELS[cell.label], cell.seed)
-            keep(tmp_path, cell, entry, settings())
-    rows = comparing.collect_rows(wanted, tmp_path, lambda cell: settings())
+            keep(tmp_path, cell, entry, run())
+    rows = comparing.collect_rows(wanted, tmp_path, lambda cell: run())
     found = {entry["system"]: entry for entry in rows}
     assert set(found) == {"sfkd", "icode"}
     assert found["icode"]["seeds"] == list(range(seeds))
@@ -173,10 +171,10 @@ def test_a_row_that_was_made_with_other_settings_or_code_is_announced(tmp_path, 
     ]
     sources = (provenance(), provenance(), {"commit": "another"})
     for cell, source in zip(listed, sources, strict=True):
-        made = settings("seed=9") if cell.label == "icode" else settings()
+        made = run("seed=9") if cell.label == "icode" else run()
         entry = row(cell.label, 1.0, 0) | {"provenance": source}
         keep(tmp_path, cell, entry, made)
-    rows = comparing.collect_rows(listed, tmp_path, lambda cell: settings())
+    rows = comparing.collect_rows(listed, tmp_path, lambda cell: run())
     assert {entry["system"] for entry in rows} == {"sfkd", "nominal"}
     said = capsys.readouterr().err
     assert "1 cells were made by other settings: left out" in said
@@ -205,37 +203,3 @@ def test_an_unfinished_comparison_marks_no_more_than_the_finished_one(tmp_path):
     assert beside["p"] == alone["p"] < 0.01
     assert alone["p_holm"] == pytest.approx(alone["p"])
     assert beside["p_holm"] == pytest.approx(10 * alone["p"])
-
-
-def test_compare_drives_every_row_names_those_that_fail_and_goes_on(tmp_path):
-    small = ("training.steps=75", "training.save_every=75", "dataset.segments=200")
-    asked = (
-        "+experiment=smoke",
-        "+comparison.rows.two='evaluation.systems=[nominal,oracle]'",
-        "+comparison.rows.wrong='training.step=3'",
-        "+comparison.rows.unknown='certification.mode=boxes'",
-        "name=table",
-        *small,
-    )
-    done = run_command("compare", *asked, cwd=tmp_path)
-    first = last_line(done)
-    document = json.loads((tmp_path / first["results"]).read_text())
-    rows = {entry["system"]: entry for entry in document["rows"]}
-    assert set(rows) == {"oracle", "sfkd"}
-    assert rows["oracle"]["difference_to_sfkd"]["mean"] < 0
-    assert len(document["failed"]) == first["failed"] == 3
-    assert "row wrong: " in done.stderr
-    assert "row two: evaluation.systems must be one system" in done.stderr
-    assert "certification.mode" in done.stderr
-    stored = tmp_path / "runs/table/cells"
-    before = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
-    (victim,) = (file for file in before if "oracle" in file.name)
-    victim.write_bytes(before[victim][:-9])
-    again = run_command("compare", *asked, cwd=tmp_path)
-    assert "training sfkd" not in again.stderr
-    after = {file: file.read_bytes() for file in stored.rglob("*.row.json")}
-    remade, first_made = (json.loads(kept.pop(victim)) for kept in (after, before))
-    assert after == before
-    for document in (remade, first_made):
-        assert document["row"].pop("provenance")
-    assert remade == first_made

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from composing import settings
+from composing import run, settings
 from helpers import any_law, space
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
@@ -117,7 +117,7 @@ def test_a_planner_without_its_settings_is_refused():
 
 
 def test_only_a_system_with_a_corridor_drives_round_obstacles():
-    chosen = settings("+experiment=s3_body", "scenario=obstacles")
-    system = build.reference_systems(build.build_vehicle(chosen.vehicle))["oracle"]
+    chosen = run("+experiment=s3_body", "scenario=obstacles")
+    system = build.reference_systems(chosen.plant)["oracle"]
     with pytest.raises(ValueError, match=r"certified corridor, and oracle has none"):
         evaluating.SystemEvaluation(chosen, "oracle", system)

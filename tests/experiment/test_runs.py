@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from composing import settings
+from composing import run, settings
 from helpers import dataset
 
-from sfkd_jax.experiment import data, runs, stages
+from sfkd_jax.experiment import dataset_files, stages
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, write_json
 
@@ -15,7 +16,7 @@ from sfkd_jax.store import ArtefactError, write_json
 @pytest.mark.parametrize("name", ["[a]", "trial=[1,2]"])
 def test_a_path_that_checkpoints_cannot_be_read_from_is_refused_at_once(tmp_path, name):
     with pytest.raises(ValueError, match=r"cannot be read back from a path with \[ \]"):
-        runs.claim(replace(settings(), root=str(tmp_path), name=name))
+        Run.of(replace(settings(), root=str(tmp_path), name=name)).claim()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -23,20 +24,20 @@ def test_a_run_that_kept_nothing_does_not_block_its_correction(tmp_path):
     """A first attempt with a mistake records its settings before it fails."""
     first = replace(settings(), root=str(tmp_path), name="a=0.1,b=c d")
     second = replace(first, training=replace(first.training, steps=25))
-    runs.claim(first)
-    runs.claim(second)
-    recorded = second.run_dir / "settings.json"
+    Run.of(first).claim()
+    Run.of(second).claim()
+    recorded = Run.of(second).directory / "settings.json"
     assert json.loads(recorded.read_text())["training"]["steps"] == 25
     (recorded.parent / "checkpoints" / "25").mkdir(parents=True)
-    runs.claim(second)
+    Run.of(second).claim()
     with pytest.raises(ArtefactError, match=r"training.steps was 25, is now 4000"):
-        runs.claim(first)
+        Run.of(first).claim()
 
 
 def test_a_data_set_comes_back_with_the_scenario_of_every_segment(tmp_path):
-    chosen, made = settings(f"root={tmp_path}"), dataset(count=20, steps=8)
-    data.write(chosen, made)
-    stored, _ = data.read(chosen)
+    source, made = run(f"root={tmp_path}").source, dataset(count=20, steps=8)
+    dataset_files.write(source.path, made, source.config)
+    stored = source.dataset
     for part, labels in made.scenarios.items():
         np.testing.assert_array_equal(stored.scenarios[part], labels)
         assert len(labels) == len(getattr(stored, part).controls)
@@ -47,19 +48,20 @@ def certified(monkeypatch, tmp_path):
     """How often a policy is certified where a certificate records some settings."""
     made = []
     monkeypatch.setattr(stages, "certify_policy", made.append)
-    monkeypatch.setattr(stages, "ensure_policy", lambda settings: None)
+    monkeypatch.setattr(Run, "policy", None)
 
     def count(recorded, *overrides):
-        first = settings(f"root={tmp_path}", *recorded)
-        first.run_dir.mkdir(parents=True, exist_ok=True)
-        (first.run_dir / "policy.safetensors").touch()
+        first = run(f"root={tmp_path}", *recorded)
+        first.directory.mkdir(parents=True, exist_ok=True)
+        first.policy_path.touch()
+        certification = first.settings.certification
         document = {
             "valid": True,
-            "certification": stages._recorded_certification(first),
+            "certification": stages._recorded_certification(certification),
         }
-        write_json(first.run_dir / "certificate.json", document)
+        write_json(first.certificate_path, document)
         made.clear()
-        stages.ensure_certificate(settings(f"root={tmp_path}", *overrides))
+        stages.ensure_certificate(run(f"root={tmp_path}", *overrides))
         return len(made)
 
     return count
@@ -84,7 +86,7 @@ PATH_MODELS = {
 
 
 def check(*overrides):
-    stages.check_settings(settings(*ALONG, *overrides))
+    stages.check_settings(run(*ALONG, *overrides))
 
 
 @pytest.mark.parametrize("name", PATH_MODELS)

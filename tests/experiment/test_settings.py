@@ -9,6 +9,7 @@ from helpers import put
 from sfkd_jax import build
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.options import parse_settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.ranges import Bounds, Positive, Span
 from sfkd_jax.settings import arguments, parse, replace, schema
 from sfkd_jax.store import plain
@@ -68,9 +69,9 @@ def test_the_line_says_what_a_setting_must_be_and_what_it_is(values, says):
 def use(name, value):
     """What `train` does before anything is made."""
     chosen = parse_settings(put(plain_settings(), name, value))
-    plant = build.build_vehicle(chosen.vehicle)
-    build.build_scenario(chosen.scenario, plant, duration=10.0)
-    stages.check_settings(chosen)
+    run = Run.of(chosen)
+    build.build_scenario(chosen.scenario, run.plant, duration=10.0)
+    stages.check_settings(run)
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,15 @@ and what they do wrong ends one run alone.
 import warnings
 from pathlib import Path
 
+import composing
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from composing import settings
 from helpers import jit
 
 from sfkd_jax import plants
-from sfkd_jax.experiment import data, evaluating
+from sfkd_jax.experiment import evaluating
 from tests.plants import simulators
 
 HERE = "tests.plants.simulators"
@@ -110,12 +110,15 @@ def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path, monkeypatch
         dataset.steps=10 dataset.shares=[0.25,0.25,0.25,0.25] root={tmp_path}
         evaluation.systems=[nominal] evaluation.episodes=2 evaluation.episode_s=3
         controller.mppi.num_samples=16"""
-    chosen = settings(*words.split())
+    run = composing.run(*words.split())
+    chosen = run.settings
     assert (chosen.vehicle.dt, chosen.vehicle.wheelbase) == (0.1, 5.0)
     assert chosen.environment.names == ("grip [-]", "side force [kN]")
-    noise = chosen.sensors(plants.own(state_names=("yaw_rate", "p_x", "load", "v")))
+    noise = chosen.evaluation.sensors(
+        plants.own(state_names=("yaw_rate", "p_x", "load", "v"))
+    )
     assert noise == (0.002, 0.015, 0.0, 0.03)  # by name, in any order
-    runs = data.ensure_dataset(chosen)[0].train
+    runs = run.source.dataset.train
     car = highway.make()
     for state, control, env, after in zip(
         runs.states[0], runs.controls[0], runs.envs[0], runs.states[0, 1:], strict=False
@@ -123,10 +126,10 @@ def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path, monkeypatch
         car.reset(np.asarray(state, float))
         expected = car.step(np.asarray(control, float), np.asarray(env, float))
         np.testing.assert_allclose(after, expected, rtol=2e-6, atol=2e-6)
-    episodes = evaluating.make_episodes(chosen)
+    episodes = evaluating.make_episodes(run)
     envs = np.asarray(episodes.scenarios.envs)
     levels = np.unique(np.abs(envs).reshape(-1, 2), axis=0)
     np.testing.assert_allclose(levels, [[1.0, 0.0]], atol=1e-6)
-    (result,) = evaluating.drive(chosen, evaluating.load_systems(chosen), episodes)
+    (result,) = evaluating.drive(run, evaluating.load_systems(run), episodes)
     assert result.row["departures"] == 0
     assert result.row["rmse_m"]["mean"] < 0.5

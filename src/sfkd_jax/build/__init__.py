@@ -29,6 +29,7 @@ from sfkd_jax.build._corridor import corridor_of as corridor_of
 from sfkd_jax.build._corridor import in_corridor as in_corridor
 from sfkd_jax.build._corridor import is_claimed as is_claimed
 from sfkd_jax.build._vehicles import IDENTIFIED as IDENTIFIED
+from sfkd_jax.build._vehicles import LOGGED as LOGGED
 from sfkd_jax.build._vehicles import PLANTS as PLANTS
 from sfkd_jax.build._vehicles import VEHICLES as VEHICLES
 from sfkd_jax.build._vehicles import LoggedVehicleSettings as LoggedVehicleSettings

@@ -13,7 +13,9 @@ from sfkd_jax.ranges import Positive, imported
 from sfkd_jax.settings import OneOf, Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Control, Reference, Space, State, Step
 
-PLANTS = plants.FACTORIES | {"own": plants.own, "logged": plants.own}
+LOGGED = "logged"
+"""The vehicle that a model of its logs is driven in place of."""
+PLANTS = plants.FACTORIES | {"own": plants.own, LOGGED: plants.own}
 """Factories of vehicles by name; the last two are of vehicles from outside."""
 IDENTIFIED = "vehicle"
 """The kind of the file that holds the model of a vehicle that is known from logs."""
@@ -73,7 +75,7 @@ class LoggedVehicleSettings(VehicleSettings):
     identified: str | None = None
 
 
-_BASES = {"own": OwnVehicleSettings, "logged": LoggedVehicleSettings}
+_BASES = {"own": OwnVehicleSettings, LOGGED: LoggedVehicleSettings}
 """Base of the settings of a vehicle, where it is not `VehicleSettings`."""
 FROM_OUTSIDE = tuple(_BASES)
 """Vehicles that are not defined in this package."""

@@ -27,7 +27,8 @@ from sfkd_jax import training
 from sfkd_jax.certification import CertificateStale, CertificationRefused
 from sfkd_jax.experiment.identified import with_identified
 from sfkd_jax.experiment.options import Settings, parse_settings
-from sfkd_jax.experiment.runs import IDENTITY
+from sfkd_jax.experiment.run import Run
+from sfkd_jax.experiment.run_directory import IDENTITY
 from sfkd_jax.experiment.schemas import register
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, print_message
@@ -44,8 +45,8 @@ LONGEST_NAME = 160
 """The most characters of a directory name of a sweep; file systems allow 255."""
 
 
-def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], None]:
-    """Make `run(settings) -> document` a command.
+def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None]:
+    """Make `command(run) -> document` a command, whose `Run` is made here.
 
     The command prints the document as JSON in the last line of stdout. Expected errors
     become one line on stderr and an exit code. A job of a sweep returns "objective" to
@@ -66,7 +67,7 @@ def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], Non
             # Small factorisations, in every step of a training: threads of BLAS would
             # wait for each other, and keep XLA's waiting, for half of the time.
             with threadpool_limits(1, user_api="blas"):
-                document = run(with_identified(settings))
+                document = command(Run.of(with_identified(settings)))
         except KeyboardInterrupt:
             print_message("sfkd_jax: interrupted; the same command continues")
             # The interpreter would first wait for compiled code that nobody needs.
@@ -89,13 +90,13 @@ def hydra_command(run: Callable[[Settings], dict[str, Any]]) -> Callable[[], Non
         config_path=conf_path(), config_name="config", version_base="1.3"
     )(main)
 
-    def command() -> None:
+    def start() -> None:
         if reason := _unusable(sys.argv[1:]):
             print_message(f"sfkd_jax: {reason}")
             sys.exit(FAILED)
         composing()
 
-    return command
+    return start
 
 
 def _unusable(words: list[str]) -> str | None:

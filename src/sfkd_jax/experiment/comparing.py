@@ -15,9 +15,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sfkd_jax import evaluation, store
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import command, evaluating, runs, stages
+from sfkd_jax.experiment import command, evaluating, run_directory, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
+from sfkd_jax.experiment.run import Run
+from sfkd_jax.experiment.source import DataSource
 from sfkd_jax.settings import replace
 from sfkd_jax.training import TrainingStopped
 
@@ -122,11 +124,11 @@ def overrides(cell: Cell, comparison: ComparisonSettings) -> list[str]:
     ]
 
 
-def settings_hash(settings: Settings) -> str:
+def settings_hash(run: Run) -> str:
     """Hash the settings that the result of a cell depends on, not the code."""
     groups = ("environment", "controller", "scenario", "certification", "evaluation")
-    further = {group: getattr(settings, group) for group in groups}
-    return store.sha256({**runs.identity(settings), **further})
+    further = {group: getattr(run.settings, group) for group in groups}
+    return store.sha256({**run.identity, **further})
 
 
 def episodes_hash(settings: Settings) -> str:
@@ -146,25 +148,23 @@ def episodes_hash(settings: Settings) -> str:
     )
 
 
-def is_done(path: Path, settings: Settings) -> bool:
+def is_done(path: Path, run: Run) -> bool:
     """Return whether an undamaged cell with exactly these settings is stored."""
     try:
         document = store.read_json(_row_file(path), keys=("row",))
-        return document["made_with"] == settings_hash(settings)
+        return document["made_with"] == settings_hash(run)
     # Damaged, missing or unfinished: the cell is evaluated again.
     except (store.ArtefactError, OSError, KeyError):
         return False
 
 
-def write_cell(
-    path: Path, directory: Path, settings: Settings, result: SystemResult
-) -> Row:
+def write_cell(path: Path, directory: Path, run: Run, result: SystemResult) -> Row:
     """Write the arrays of the first episodes, then the row, and return the row.
 
     Args:
         path: of the cell, without a suffix.
         directory: of the comparison.
-        settings: of the cell.
+        run: of the cell.
         result: of the system that the cell evaluates.
     """
     stored = {
@@ -172,16 +172,16 @@ def write_cell(
         for name, array in result.arrays.items()
     }
     name = str(path.with_name(f"{path.name}{store.SUFFIX}").relative_to(directory))
-    row = runs.keep_episodes(directory, name, result.row, stored)
-    row["provenance"] = runs.provenance()
+    row = run_directory.keep_episodes(directory, name, result.row, stored)
+    row["provenance"] = run_directory.provenance()
     # The row last: its file is what marks a cell as done.
-    document = {"row": row, "made_with": settings_hash(settings)}
+    document = {"row": row, "made_with": settings_hash(run)}
     store.write_json(_row_file(path), document)
     return row
 
 
 def collect_rows(
-    cells: list[Cell], directory: Path, compose_cell: Callable[[Cell], Settings]
+    cells: list[Cell], directory: Path, run_of: Callable[[Cell], Run]
 ) -> list[Row]:
     """Return the rows of all stored cells, with seeds pooled and systems compared."""
     pooled: dict[Cell, list[Row]] = {cell._replace(seed=0): [] for cell in cells}
@@ -192,14 +192,14 @@ def collect_rows(
         if not path.exists():
             continue
         document = store.read_json(path, keys=("row", "made_with"))
-        settings = compose_cell(cell)
-        if document["made_with"] != settings_hash(settings):
+        run = run_of(cell)
+        if document["made_with"] != settings_hash(run):
             with_other_settings.append(path)
             continue
-        row = {**document["row"], "drives": episodes_hash(settings)}
+        row = {**document["row"], "drives": episodes_hash(run.settings)}
         # Seeds of a row are pooled under one key.
         pooled[cell._replace(seed=0)].append(row)
-        if row.get("provenance") != runs.provenance():
+        if row.get("provenance") != run_directory.provenance():
             by_other_code.append(path)
     _print_count(with_other_settings, "other settings: left out")
     _print_count(by_other_code, "other code: used")
@@ -233,8 +233,9 @@ class Comparison:
         self.cells = list_cells(settings.comparison)
         self.failed: dict[str, str] = {}
         self._settings = settings
-        # Composed once: every cell is asked for its settings several times.
-        self._compose = functools.cache(self._settings_of)
+        # Composed once: every cell is asked for its run several times.
+        self._run_of = functools.cache(self._compose)
+        self._sources: dict[str, DataSource] = {}
         self._episodes: dict[str, EpisodeSet] = {}
 
     def evaluate(self) -> int:
@@ -254,20 +255,23 @@ class Comparison:
     def rows(self) -> list[Row]:
         """Return the rows of all stored cells; a ValueError if there is none."""
         with store.as_artefact_error(self.directory / "cells"):
-            rows = collect_rows(self.cells, self.directory, self._compose)
+            rows = collect_rows(self.cells, self.directory, self._run_of)
         if not rows:
             reasons = "; ".join(self.failed.values()) or "none was requested"
             raise ValueError(f"nothing to compare: no row came out ({reasons})")
         return rows
 
-    def _settings_of(self, cell: Cell) -> Settings:
-        """Return the settings of a cell, under the name of the comparison."""
+    def _compose(self, cell: Cell) -> Run:
+        """Return the run of a cell, under the name of the comparison."""
         try:
             composed = command.compose(*overrides(cell, self._settings.comparison))
         except (HydraException, OmegaConfBaseException) as reason:
             line = " ".join(str(reason).split("\n")[0].split())
             raise ValueError(f"row {cell.label}: {line}") from None
-        return replace(composed, name=self._settings.name)
+        run = Run.of(replace(composed, name=self._settings.name))
+        # Rows on the same data read them, and simulate runs of S3, once.
+        key = store.sha256([str(run.source.path), run.source.environment])
+        return Run(run.settings, self._sources.setdefault(key, run.source))
 
     @contextmanager
     def _recorded_if_it_fails(self, group: list[Cell]) -> Iterator[None]:
@@ -282,18 +286,18 @@ class Comparison:
     def _check(self, group: list[Cell]) -> None:
         """Build what the cells of one row need that are not done, without training."""
         pending = list(self._pending(group))
-        for _, settings, _ in pending:
-            self._make_episodes(settings)
+        for _, run, _ in pending:
+            self._make_episodes(run)
         # One check a row: its cells differ in scenario alone, and build the same.
-        for cell, settings, _ in pending[:1]:
-            systems = settings.evaluation.systems
+        for cell, run, _ in pending[:1]:
+            systems = run.settings.evaluation.systems
             if len(systems) != 1:
                 raise ValueError(
                     f"row {cell.label}: evaluation.systems must be one system, "
                     f"got {list(systems)}"
                 )
             if "self" in systems:
-                stages.check_settings(self._of_policy(cell, settings))
+                stages.check_settings(self._of_policy(cell, run))
 
     def _evaluate(self, group: list[Cell]) -> int:
         """Evaluate the cells of one row under one controller that are not done.
@@ -302,41 +306,42 @@ class Comparison:
         """
         evaluate = None
         evaluated = 0
-        for cell, settings, path in self._pending(group):
-            episodes = self._make_episodes(settings)
+        for cell, run, path in self._pending(group):
+            episodes = self._make_episodes(run)
             # Compiled once for all scenarios.
             if evaluate is None:
-                evaluate = self._compiled(cell, settings)
+                evaluate = self._compiled(cell, run)
             result = evaluate(episodes)
-            write_cell(path, self.directory, settings, result)
+            write_cell(path, self.directory, run, result)
             error = 1e3 * result.row["rmse_m"]["mean"]
             store.print_message(f"{' '.join(map(str, cell))}: {error:.1f} mm")
             evaluated += 1
         return evaluated
 
-    def _pending(self, group: list[Cell]) -> Iterator[tuple[Cell, Settings, Path]]:
-        """Yield the cells that are not done, with their settings and their paths."""
+    def _pending(self, group: list[Cell]) -> Iterator[tuple[Cell, Run, Path]]:
+        """Yield the cells that are not done, with their runs and their paths."""
         for cell in group:
-            settings = self._compose(cell)
+            run = self._run_of(cell)
             path = cell.path(self.directory)
-            if not is_done(path, settings):
-                yield cell, settings, path
+            if not is_done(path, run):
+                yield cell, run, path
 
-    def _of_policy(self, cell: Cell, settings: Settings) -> Settings:
-        """Return the settings of a cell, named after the run that trains its policy."""
+    def _of_policy(self, cell: Cell, run: Run) -> Run:
+        """Return the run that trains the policy of a cell."""
         policies = self._settings.comparison.policies
-        return replace(settings, name=f"{policies}/{cell.vehicle}/{cell.label}")
+        return run.named(f"{policies}/{cell.vehicle}/{cell.label}")
 
-    def _compiled(self, cell: Cell, settings: Settings) -> evaluating.SystemEvaluation:
+    def _compiled(self, cell: Cell, run: Run) -> evaluating.SystemEvaluation:
         """Compile the system of a row; train and certify it first if it learns."""
-        settings = self._of_policy(cell, settings)
-        if "self" in settings.evaluation.systems:
-            stages.ensure_certificate(settings)
-        ((name, system),) = evaluating.load_systems(settings).items()
-        return evaluating.SystemEvaluation(settings, name, system)
+        run = self._of_policy(cell, run)
+        if "self" in run.settings.evaluation.systems:
+            stages.ensure_certificate(run)
+        ((name, system),) = evaluating.load_systems(run).items()
+        return evaluating.SystemEvaluation(run, name, system)
 
-    def _make_episodes(self, settings: Settings) -> EpisodeSet:
+    def _make_episodes(self, run: Run) -> EpisodeSet:
         """Return the episodes of a cell; rows that are compared share them."""
+        settings = run.settings
         # Not the controller: rows are paired because they meet the same episodes.
         key = store.sha256(
             [
@@ -347,7 +352,7 @@ class Comparison:
             ]
         )
         if key not in self._episodes:
-            self._episodes[key] = evaluating.make_episodes(settings)
+            self._episodes[key] = evaluating.make_episodes(run)
         return self._episodes[key]
 
 

@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array
 
 from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.build import System
+from sfkd_jax.build import ScenarioSettings, System
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import data, laws, runs, stages
+from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import Vehicle, check_step
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.scenarios import COURSES, Scenario
-from sfkd_jax.settings import arguments, choose, replace
+from sfkd_jax.settings import arguments, choose
 from sfkd_jax.types import Controller, Key, Params
 
 
@@ -53,14 +53,14 @@ class SystemResult(NamedTuple):
     arrays: dict[str, np.ndarray]
 
 
-def make_episodes(settings: Settings) -> EpisodeSet:
-    """Draw the episodes of a scenario."""
-    plant = build.build_vehicle(settings.vehicle)
+def make_episodes(run: Run) -> EpisodeSet:
+    """Draw the episodes of the scenario of a run."""
+    settings = run.settings
+    plant = run.plant
     protocol = settings.evaluation
-    check_step(plant, len(settings.environment.low or (0, 0)))
-    box: Any = settings.environment.box
+    run.source.check_plant()
     family = build.build_scenario(
-        settings.scenario, plant, duration=protocol.episode_s, **box
+        settings.scenario, plant, duration=protocol.episode_s, **run.source.box
     )
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
 
@@ -124,25 +124,27 @@ def _available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def load_systems(settings: Settings) -> dict[str, System]:
+def load_systems(run: Run) -> dict[str, System]:
     """Return the systems of `evaluation.systems` by name.
 
     "self" is the policy of the run, which is trained if it is missing; "law_nominal" is
     "law" with the law that is derived from the nominal model, and so on. With
     `environment.source=estimated` every system that reads e estimates it.
     """
-    plant = build.build_vehicle(settings.vehicle)
-    references = build.reference_systems(plant, laws.ensure_law(settings))
+    settings = run.settings
+    references = build.reference_systems(run.plant, run.law)
     systems = {}
     for name in settings.evaluation.systems:
-        if name == "oracle" and getattr(settings.vehicle, "env", None):
+        if name == "oracle" and run.source.has_simulator:
             store.print_message("no oracle: it would plan with copies of the simulator")
             continue
         if name == "self":
-            systems[settings.model.system] = _policy_system(settings)
+            systems[settings.model.system] = _policy_system(run)
             continue
-        if settings.along_path and name in build.LAWS_ALONE:
-            references[name] = _law_alone(settings, plant, build.LAWS_ALONE[name])
+        if run.source.along_path and name in build.LAWS_ALONE:
+            source = run.source.with_law_of(build.LAWS_ALONE[name])
+            alone = build.reference_systems(run.plant, source.law)
+            references[name] = alone["law"]
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
             system = system._replace(env_source="estimated")
@@ -150,44 +152,31 @@ def load_systems(settings: Settings) -> dict[str, System]:
     return systems
 
 
-def _law_alone(settings: Settings, plant: Vehicle, law_model: str) -> System:
-    """Return the system "law" with the law that is derived from another model.
-
-    Args:
-        settings: of the run, along a path.
-        plant: its vehicle.
-        law_model: the model, one of `build.LAW_MODELS`.
-    """
-    along: Any = settings.along_path
-    dataset = replace(along, law=replace(along.law, model=law_model))
-    law = laws.ensure_law(replace(settings, dataset=dataset))
-    return build.reference_systems(plant, law)["law"]
-
-
-def _policy_system(settings: Settings) -> System:
+def _policy_system(run: Run) -> System:
     """Return the policy of the run as a system, with a certificate if it has one."""
-    trained = stages.ensure_policy(settings)
-    certificate, reason = policy.read_certificate(settings.run_dir, trained)
+    trained = run.policy
+    certificate, reason = policy.read_certificate(run.directory, trained)
     if certificate is None:
         store.print_message(f"nothing is certified: {reason}")
     # A policy that reads no e is given no estimate of it either.
     reads_env = trained.settings["model"]["environment"]
-    env_source = settings.environment.source if reads_env else "none"
+    env_source = run.settings.environment.source if reads_env else "none"
     return System(trained.model, trained.params, env_source, certificate, trained.law)
 
 
 class SystemEvaluation:
     """One system, compiled once for all sets of episodes of one length."""
 
-    def __init__(self, settings: Settings, name: str, system: System) -> None:
+    def __init__(self, run: Run, name: str, system: System) -> None:
         """Build the controller."""
-        plant = build.build_vehicle(settings.vehicle)
-        self._settings = settings
+        settings = run.settings
+        plant = run.plant
+        self._side_forces = settings.evaluation.side_forces
         self._plant = plant
-        box: Any = settings.environment.box
-        if settings.logs:
+        box: Any = run.source.box
+        if run.source.logs:
             # The settings of logs state no box of e: it is measured.
-            dataset, _ = data.ensure_dataset(settings)
+            dataset = run.source.dataset
             box = {"env_low": dataset.env_low, "env_high": dataset.env_high}
         self.controller = build.build_controller(
             settings.controller,
@@ -198,8 +187,8 @@ class SystemEvaluation:
             env_source=system.env_source,
             law=system.law,
         )
-        if has_course(settings):
-            self.controller = _in_lane(name, system, plant, settings, self.controller)
+        if has_course(settings.scenario):
+            self.controller = _in_lane(run, name, system, self.controller)
         # Folded once here; otherwise every control step would fold again.
         self.params = fold(system.model, system.params, on_host)
         self._columns = _columns(settings, name, system)
@@ -209,7 +198,7 @@ class SystemEvaluation:
             self.controller,
             horizon=settings.controller.horizon,
             dt=plant.dt,
-            observation_noise=settings.sensors(plant),
+            observation_noise=run.sensors,
             size=plant.size,
         )
         self._simulate = _over_episodes(simulate)
@@ -218,10 +207,9 @@ class SystemEvaluation:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores = self._scored(episodes, 0.0)
         row = evaluation.row(scores, {**self._columns, "scenario": episodes.name})
-        forces = self._settings.evaluation.side_forces
-        if forces:
+        if self._side_forces:
             row["disturbed"] = []
-        for force in forces:
+        for force in self._side_forces:
             # Without a force the episodes are those above, and not simulated again.
             if force:
                 _, scores = self._scored(episodes, force)
@@ -258,27 +246,25 @@ class SystemEvaluation:
         return episode, scores
 
 
-def has_course(settings: Settings) -> bool:
+def has_course(scenario: ScenarioSettings) -> bool:
     """Return whether there are obstacles on the road, and scenes, not references."""
-    return settings.scenario.name in COURSES
+    return scenario.name in COURSES
 
 
-def _in_lane(
-    name: str, system: System, plant: Vehicle, settings: Settings, inner: Controller
-) -> Controller:
+def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controller:
     """Return a controller of scenes around one of references."""
     if system.law is None or not (system.certificate or {}).get("corridor"):
         raise ValueError(
-            f"scenario={settings.scenario.name} needs systems with a certified "
+            f"scenario={run.settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
         )
     return build.build_in_lane(
         inner,
-        plant,
+        run.plant,
         system.law,
         system.certificate or {},
-        horizon=settings.controller.horizon,
-        car=plant.size,
+        horizon=run.settings.controller.horizon,
+        car=run.plant.size,
         planner="mppi",
         friction=0,
     )
@@ -306,13 +292,13 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
     }
 
 
-def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
+def evaluate_run(run: Run, *, command: str | None = None) -> Path:
     """Evaluate every system of `evaluation.systems` and add its rows to the results.
 
     Rows of other scenarios and controllers in the same run stay.
 
     Args:
-        settings: of the run.
+        run: whose systems they are.
         command: the command as it was typed, which is stored with the results.
 
     Returns:
@@ -320,18 +306,18 @@ def evaluate_run(settings: Settings, *, command: str | None = None) -> Path:
     """
     began = time.perf_counter()
     # Vehicle and earlier results are checked before anything is trained.
-    episodes = make_episodes(settings)
-    runs.read_results(settings.run_dir)
-    systems = load_systems(settings)
-    config = store.plain(settings)
+    episodes = make_episodes(run)
+    run_directory.read_results(run.directory)
+    systems = load_systems(run)
+    config = store.plain(run.settings)
     if command:
         config["command"] = command
 
     def keep(results: list[SystemResult]) -> Path:
         seconds = time.perf_counter() - began
-        return runs.write_results(settings.run_dir, config, results, seconds)
+        return run_directory.write_results(run.directory, config, results, seconds)
 
-    return keep(drive(settings, systems, episodes, keep))
+    return keep(drive(run, systems, episodes, keep))
 
 
 def _keep_nothing(results: list[SystemResult]) -> None:
@@ -339,7 +325,7 @@ def _keep_nothing(results: list[SystemResult]) -> None:
 
 
 def drive(
-    settings: Settings,
+    run: Run,
     systems: Mapping[str, System],
     episodes: EpisodeSet,
     keep: Callable[[list[SystemResult]], Any] = _keep_nothing,
@@ -347,15 +333,15 @@ def drive(
     """Simulate, score and compare systems on the same episodes, with messages.
 
     Args:
-        settings: of the run.
+        run: whose systems they are.
         systems: by name.
         episodes: that all of them drive.
         keep: receives the result of each system when it is done, so that a command that
             is stopped loses the results of no other system.
     """
-    protocol = settings.evaluation
+    protocol = run.settings.evaluation
     length = f"{protocol.episodes} episodes of {protocol.episode_s:.0f} s"
-    if has_course(settings):
+    if has_course(run.settings.scenario):
         # Only a corridor keeps a car clear of what it passes: the others are left out.
         certified = {
             name: system for name, system in systems.items() if system.certificate
@@ -364,7 +350,7 @@ def drive(
     results: list[SystemResult] = []
     for name, system in systems.items():
         store.print_message(f"driving {length}: {name} on {episodes.name}")
-        result = SystemEvaluation(settings, name, system)(episodes)
+        result = SystemEvaluation(run, name, system)(episodes)
         results.append(result)
         keep([result])
         error = result.row["rmse_m"]["mean"]

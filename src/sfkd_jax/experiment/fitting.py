@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import policy, store
 from sfkd_jax.data import (
     SCENARIOS,
     Dataset,
@@ -17,8 +18,9 @@ from sfkd_jax.data import (
     spread_windows,
 )
 from sfkd_jax.evaluation import open_loop
-from sfkd_jax.experiment import identified, laws, runs
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment import identified
+from sfkd_jax.experiment.options import TrainingSettings
+from sfkd_jax.experiment.source import DataSource
 from sfkd_jax.models import physics
 from sfkd_jax.ranges import in_words
 from sfkd_jax.rollout import fold, on_host
@@ -36,69 +38,89 @@ PLANNING_STEPS = 2
 """Optimiser steps of g for each of those of the model."""
 
 
-def train_policy(settings: Settings, dataset: Dataset, data_hash: str) -> None:
-    """Train, then write the best weights and their errors on the test part."""
-    recorded = runs.policy_settings(settings, dataset)
+def train_policy(
+    directory: Path,
+    recorded: dict[str, Any],
+    source: DataSource,
+    training: TrainingSettings,
+    *,
+    system: str,
+    seed: int,
+) -> None:
+    """Train, then write the best weights and their errors on the test part.
+
+    Args:
+        directory: of the run.
+        recorded: the settings to store with the policy, as plain values.
+        source: of the data that it is trained on.
+        training: how it is trained.
+        system: name of the model in messages.
+        seed: of the initial weights and of the training windows.
+    """
+    dataset = source.dataset
     space = measure_space(dataset)
     recorded["space"] = space._asdict()
     # The same model as that of `restore`, for which everything is then compiled.
     plant, model = policy.built(recorded)
-    if settings.environment.is_known and not settings.logs:
+    environment = source.environment
+    if environment.is_known and not source.logs:
         labels = [entry.label for entry in plant.environment]
-        names = settings.environment.names or labels
+        names = environment.names or labels
         box = in_words(names, dataset.env_low, dataset.env_high)
         store.print_message(f"the model reads e: {box}")
-    key = jax.random.fold_in(jax.random.key(settings.seed), 0)
-    loss = multi_step_loss(
-        model, space, **arguments(settings.training.loss, multi_step_loss)
-    )
-    params, best_step = _fit_model(settings, model, loss, dataset, key)
+    key = jax.random.fold_in(jax.random.key(seed), 0)
+    loss = multi_step_loss(model, space, **arguments(training.loss, multi_step_loss))
+    message = f"training {system}, {training.steps} steps, in {directory}"
+    if model.fitting.identify is not None:
+        message = f"identifying {system} in {directory}"
+    store.print_message(message)
+    params, best_step = _fit_model(directory, training, model, loss, dataset, key)
     recorded["best_step"] = best_step
     if model.planning is not None:
         planning_key = jax.random.fold_in(key, 1)
-        residual = _fit_planning(settings, model, params, space, dataset, planning_key)
+        residual = _fit_planning(training, model, params, space, dataset, planning_key)
         params = {**params, "planning": residual}
-    document = _open_loop_document(settings, model, params, dataset)
-    document["validation_score"] = _validation_score(settings, loss, params, dataset)
-    store.write_json(settings.run_dir / "open_loop.json", document)
+    document = _open_loop_document(source, model, params, horizon=training.window)
+    document["validation_score"] = _validation_score(training, loss, params, dataset)
+    store.write_json(directory / "open_loop.json", document)
     policy.save(
-        settings.policy_path,
+        policy.policy_file(directory),
         params,
         recorded,
-        made_from={"dataset": data_hash},
-        law=laws.ensure_law(settings),
+        made_from={"dataset": source.dataset_sha256},
+        law=source.law,
     )
 
 
 def _fit_model(
-    settings: Settings, model: Model, loss: Loss, dataset: Dataset, key: Key
+    directory: Path,
+    training: TrainingSettings,
+    model: Model,
+    loss: Loss,
+    dataset: Dataset,
+    key: Key,
 ) -> tuple[Params, int | None]:
     """Return the weights of a model, and the optimiser step that they are from.
 
     A model that is identified by regression has no such step.
     """
-    run_dir = settings.run_dir
-    system = settings.model.system
     if model.fitting.identify is not None:
-        store.print_message(f"identifying {system} in {run_dir}")
         params = model.fitting.identify(dataset.train, dataset.validation, key)
         return params, None
-    options = settings.training
-    store.print_message(f"training {system}, {options.steps} steps, in {run_dir}")
     return fit(
         model,
         loss,
-        partial(random_windows, batch=options.batch, length=options.window),
+        partial(random_windows, batch=training.batch, length=training.window),
         dataset.train,
-        _validation_windows(settings, dataset),
+        _validation_windows(training, dataset),
         key,
-        run_dir,
-        **arguments(options, fit),
+        directory,
+        **arguments(training, fit),
     )
 
 
 def _fit_planning(
-    settings: Settings,
+    training: TrainingSettings,
     model: Model,
     params: Params,
     space: Space,
@@ -113,22 +135,22 @@ def _fit_planning(
         partial(random_windows, batch=PLANNING_BATCH, length=1),
         dataset.train,
         key,
-        steps=PLANNING_STEPS * settings.training.steps,
+        steps=PLANNING_STEPS * training.steps,
         learning_rate=PLANNING_RATE,
     )
 
 
-def _validation_windows(settings: Settings, dataset: Dataset) -> Trajectory:
+def _validation_windows(training: TrainingSettings, dataset: Dataset) -> Trajectory:
     """Return the windows of the validation part on which losses are compared."""
     # Fixed windows: validation losses at different steps are comparable.
-    return spread_windows(dataset.validation, length=settings.training.window)
+    return spread_windows(dataset.validation, length=training.window)
 
 
 def _validation_score(
-    settings: Settings, loss: Loss, params: Params, dataset: Dataset
+    training: TrainingSettings, loss: Loss, params: Params, dataset: Dataset
 ) -> float:
     """Return the mean validation loss over `SCORED_SCENARIOS`, for a search."""
-    windows = _validation_windows(settings, dataset)
+    windows = _validation_windows(training, dataset)
     _, _, scores = loss.validate(params, windows)
     scores = np.asarray(scores)
     if dataset.scenarios is not None:
@@ -140,14 +162,12 @@ def _validation_score(
 
 
 def _open_loop_document(
-    settings: Settings, model: Model, params: Params, dataset: Dataset
+    source: DataSource, model: Model, params: Params, *, horizon: int
 ) -> dict[str, Any]:
     """Return the content of open_loop.json: errors by steps ahead, beside baselines."""
-    horizon = settings.training.window
-    is_along_path = settings.along_path is not None
-    plant = build.build_vehicle(settings.vehicle)
-    if is_along_path:
-        plant = laws.closed_loop(settings)
+    dataset = source.dataset
+    is_along_path = source.along_path is not None
+    plant = source.loop if is_along_path else source.plant
     steps = {"kinematic_bicycle": plant.nominal}
     # Controls along a path are perturbations of a law, which is not linear.
     if not is_along_path:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import build, models, store
-from sfkd_jax.build import LoggedVehicleSettings, VehicleSettings
+from sfkd_jax.build import LoggedVehicleSettings
 from sfkd_jax.data import (
     PARTS,
     Columns,
@@ -25,6 +25,7 @@ from sfkd_jax.data import (
 )
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.experiment.options import EnvironmentSettings, LogSettings, Settings
+from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import arguments, replace
 from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import Key, Model, Params, Step
@@ -42,12 +43,11 @@ HORIZON = 20
 
 
 def read(
-    vehicle: VehicleSettings,
+    plant: Vehicle,
     environment: EnvironmentSettings,
     logs: LogSettings | LoggedVehicleSettings,
 ) -> LoggedDataset:
     """Read the logs of a vehicle."""
-    plant = build.build_vehicle(vehicle)
     columns = Columns(**arguments(logs.columns, Columns))
     if len(columns.state) != len(plant.state_names):
         raise ValueError(
@@ -84,7 +84,7 @@ def with_identified(settings: Settings) -> Settings:
     if vehicle.path is None:
         raise ValueError("vehicle=logged needs vehicle.path=FOLDER, where its logs are")
     vehicle = replace(vehicle, contents=fingerprint(vehicle.path))
-    path, arrays = _ensure_identified(settings, vehicle)
+    path, arrays = _ensure_identified(Path(settings.root), vehicle, environment)
     reached = {name: np.asarray(value).tolist() for name, value in arrays.items()}
     limits = {name: getattr(vehicle, name) or reached[name] for name in LIMITS}
     scenario: Any = settings.scenario
@@ -96,40 +96,44 @@ def with_identified(settings: Settings) -> Settings:
             environment,
             low=reached["env_low"],
             high=reached["env_high"],
-            names=environment.names or _env_columns(settings, vehicle),
+            names=environment.names or _env_columns(environment, vehicle),
         ),
         scenario=replace(scenario, speed=min(max(scenario.speed, slowest), fastest)),
         dataset=_within(settings.dataset, reached),
     )
 
 
-def _env_columns(settings: Settings, vehicle: LoggedVehicleSettings) -> tuple[str, ...]:
+def _env_columns(
+    environment: EnvironmentSettings, vehicle: LoggedVehicleSettings
+) -> tuple[str, ...]:
     """Return the columns of the logs that hold e; none if nobody measured it."""
-    if settings.environment.is_known:
+    if environment.is_known:
         return vehicle.columns.environment
     return ()
 
 
 def _ensure_identified(
-    settings: Settings, vehicle: LoggedVehicleSettings
+    root: Path, vehicle: LoggedVehicleSettings, environment: EnvironmentSettings
 ) -> tuple[Path, dict[str, np.ndarray]]:
     """Return the file of the model of a vehicle, and its arrays; fit it if missing.
 
     Args:
-        settings: of the run.
+        root: the directory of all artefacts.
         vehicle: with the hash of its logs in `contents`.
+        environment: settings of E.
     """
-    environment = settings.environment
     config = store.plain({"vehicle": vehicle, "environment": environment.box})
     # Contents instead of the path: the same logs elsewhere make the same model.
     del config["vehicle"]["path"]
     config["environment_known"] = environment.is_known
     folder = f"logged-{store.sha256(config)[:8]}"
-    path = Path(settings.root) / "vehicles" / folder / "vehicle.safetensors"
+    path = root / "vehicles" / folder / "vehicle.safetensors"
     with store.locked(path.parent, wait=True):  # other runs share the vehicle
         if not path.is_file():
-            logged = read(vehicle, environment, vehicle).dataset
-            env_low, env_high = _logged_env_box(logged, _env_columns(settings, vehicle))
+            plant = build.build_vehicle(vehicle)
+            logged = read(plant, environment, vehicle).dataset
+            names = _env_columns(environment, vehicle)
+            env_low, env_high = _logged_env_box(logged, names)
             arrays = _identify(logged, vehicle.dt)
             arrays["env_low"] = env_low
             arrays["env_high"] = env_high

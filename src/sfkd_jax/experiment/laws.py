@@ -1,18 +1,19 @@
-"""The law of a run along a path: loaded if it exists, derived if it does not."""
+"""The law of a data set along a path, derived from a model of the vehicle."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, models, store
-from sfkd_jax.build import LoggedVehicleSettings
+from sfkd_jax import models, store
+from sfkd_jax.build import LOGGED
 from sfkd_jax.control import (
     TEXTBOOK,
     PathLaw,
@@ -22,11 +23,10 @@ from sfkd_jax.control import (
 )
 from sfkd_jax.data import generate_along_path, generate_open_loop, split
 from sfkd_jax.experiment import identified
-from sfkd_jax.experiment.dataset_files import dataset_config, dataset_path
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.options import AlongPathSettings
 from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.settings import arguments
-from sfkd_jax.types import BODY, Step, Trajectory
+from sfkd_jax.types import BODY, Key, Step, Trajectory
 
 LAW = "law"
 """The kind of the file of a law."""
@@ -46,88 +46,106 @@ and `SLACK_MM`.
 SLACK_MM = 5.0
 
 
-def ensure_law(settings: Settings) -> PathLaw | None:
-    """Return the law of the data set, derived if it is missing; None in the world."""
-    if settings.along_path is None:
-        return None
-    path = dataset_path(settings).with_name("law.safetensors")
-    config = dataset_config(settings)
-    if not path.is_file():
-        law = jax.device_get(derive_law(settings))
-        store.write_arrays(path, law._asdict(), kind=LAW, config=config)
+def write(path: Path, law: PathLaw, config: dict[str, Any]) -> None:
+    """Write a law, with the settings that it depends on."""
+    tables = jax.device_get(law)._asdict()
+    store.write_arrays(path, tables, kind=LAW, config=config)
+
+
+def read(path: Path, config: dict[str, Any]) -> PathLaw:
+    """Return the law in a file, which must have been made with these settings."""
     arrays, _ = store.read_arrays(path, kind=LAW, config=config)
     return law_from_arrays(arrays)
 
 
-def closed_loop(settings: Settings) -> Vehicle:
-    """Return the closed loop of vehicle and law, in path coordinates."""
-    law: Any = ensure_law(settings)
-    return build.build_loop(build.build_vehicle(settings.vehicle), law)
+def derive_law(
+    plant: Vehicle,
+    drives: AlongPathSettings,
+    box: dict[str, Any],
+    *,
+    simulator: bool = False,
+) -> PathLaw:
+    """Derive the law of a data set from the model that its settings name.
 
-
-def derive_law(settings: Settings) -> PathLaw:
-    """Derive the law of the data set from the model that its settings name.
+    Args:
+        plant: that the law drives.
+        drives: settings of the data set and of its law.
+        box: the corners of E.
+        simulator: whether the plant is one on the host, whose failed runs are dropped.
 
     Raises:
         ValueError: the law of a learned model does not hold the vehicle on its paths.
     """
-    along: Any = settings.along_path
-    plant = build.build_vehicle(settings.vehicle)
-    name = along.law.model
-    step = _step_of_model(settings, plant, name)
+    name = drives.law.model
+    simulate = _Simulation(plant, drives, box, simulator)
+    step = _step_of_model(simulate, name)
     store.print_message(
         f"deriving the law of vehicle {plant.name} from its {name} model"
     )
-    box = settings.environment.box
     derive = partial(
         derive_path_law,
         step,
         coordinates=len(plant.state_names) - 1,
         **{corner: tuple(map(float, ends)) for corner, ends in box.items()},
-        **arguments(along.law, derive_path_law),
+        **arguments(drives.law, derive_path_law),
     )
     law = jax.jit(derive)()
     if name in TEXTBOOK:
-        return _best_textbook_law(settings, plant, law, name)
+        return _best_textbook_law(simulate, law, name)
     # Beside itself a model of logs would find nothing.
     if name != "plant" and step is not plant.step:
-        _check_law(settings, plant, law, step)
+        _check_law(simulate, law, step)
     return law
 
 
-def _step_of_model(settings: Settings, plant: Vehicle, name: str) -> Step:
+class _Simulation(NamedTuple):
+    """What a law is derived for: see `derive_law`."""
+
+    plant: Vehicle
+    drives: AlongPathSettings
+    box: dict[str, Any]
+    simulator: bool
+
+    def key(self, stream: int) -> Key:
+        """Return the key of a stream of the data set's seed."""
+        return jax.random.fold_in(jax.random.key(self.drives.seed), stream)
+
+
+def _step_of_model(simulate: _Simulation, name: str) -> Step:
     """Return the step of the model that a law is derived from.
 
     Args:
-        settings: of the run.
-        plant: its vehicle.
+        simulate: what the law is for.
         name: of the model, one of `build.LAW_MODELS`.
     """
+    plant = simulate.plant
     if name in ("nominal", *TEXTBOOK):
         return plant.nominal
     # A model of logs is a learned one already.
-    if name == "learned" and not isinstance(settings.vehicle, LoggedVehicleSettings):
-        return _learned_step(settings, plant)
+    if name == "learned" and plant.name != LOGGED:
+        return _learned_step(simulate)
     return plant.step
 
 
-def _learned_step(settings: Settings, plant: Vehicle) -> Step:
+def _learned_step(simulate: _Simulation) -> Step:
     """Return the step of a regression of runs without a law, over the law's axes."""
-    along: Any = settings.along_path
-    box = settings.environment.box
-    seed = jax.random.fold_in(jax.random.key(settings.dataset.seed), OPEN_LOOP_STREAM)
+    plant = simulate.plant
+    law = simulate.drives.law
+    box = simulate.box
+    seed = simulate.key(OPEN_LOOP_STREAM)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
     began = time.perf_counter()
     # A little beyond the axes, at whose ends steady turns are sought.
-    slowest, fastest = along.law.speed
+    slowest, fastest = law.speed
     drive = partial(
         generate_open_loop,
         plant,
         speed=(0.8 * slowest, 1.1 * fastest),
-        lateral_acceleration=1.2 * along.law.lateral_acceleration,
+        lateral_acceleration=1.2 * law.lateral_acceleration,
         **box,
     )
-    (runs,) = without_faults(settings, jax.jit(drive)(run_key))
+    driven = jax.jit(drive)(run_key)
+    (runs,) = without_faults(driven, simulator=simulate.simulator)
     dataset = split(runs, split_key, shares=(0.9, 0.05, 0.025, 0.025), **box)
     model, _, params = identified.regression(dataset, start_key, fit_key)
     store.print_message(
@@ -137,18 +155,16 @@ def _learned_step(settings: Settings, plant: Vehicle) -> Step:
     return models.step_of(model, params)
 
 
-def _best_textbook_law(
-    settings: Settings, plant: Vehicle, law: PathLaw, name: str
-) -> PathLaw:
+def _best_textbook_law(simulate: _Simulation, law: PathLaw, name: str) -> PathLaw:
     """Return the law of a textbook whose constant keeps the vehicle nearest its paths.
 
     Args:
-        settings: of the run.
-        plant: its vehicle.
+        simulate: what the law is for.
         law: whose steady turns the law of the textbook shares.
         name: of the textbook's law, in `control.TEXTBOOK`.
     """
-    lateral_error = _lateral_error(settings, plant, plant.step)
+    plant = simulate.plant
+    lateral_error = _lateral_error(simulate, plant.step)
     laws = [
         textbook_law(law, name, constant, wheelbase=plant.wheelbase)
         for constant in TEXTBOOK[name]
@@ -161,16 +177,16 @@ def _best_textbook_law(
     return laws[int(np.argmin(errors))]
 
 
-def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> None:
+def _check_law(simulate: _Simulation, law: PathLaw, step: Step) -> None:
     """Drive the vehicle by the law alone, beside the model that it was derived from.
 
     Where the vehicle strays much farther than the model, the model is not that of the
     vehicle: a learned one is refused, the textbook's is what the settings ask for.
     """
-    along: Any = settings.along_path
-    name = along.law.model
-    error = _lateral_error(settings, plant, plant.step)(law)
-    promised = _lateral_error(settings, plant, step)(law)
+    plant = simulate.plant
+    name = simulate.drives.law.model
+    error = _lateral_error(simulate, plant.step)(law)
+    promised = _lateral_error(simulate, step)(law)
     line = (
         f"the law of the {name} model keeps vehicle {plant.name} within {error:.1f} mm "
         f"(RMS) of its paths, the model promises {promised:.1f} mm"
@@ -184,30 +200,28 @@ def _check_law(settings: Settings, plant: Vehicle, law: PathLaw, step: Step) -> 
     store.print_message(line)
 
 
-def _lateral_error(
-    settings: Settings, plant: Vehicle, step: Step
-) -> Callable[[PathLaw], float]:
+def _lateral_error(simulate: _Simulation, step: Step) -> Callable[[PathLaw], float]:
     """Return law -> the lateral error of a step under it alone [mm, RMS]."""
-    along: Any = settings.along_path
-    perturbation = along.law.perturbation
+    drives = simulate.drives
+    perturbation = drives.law.perturbation
     options = {
-        **along.options,
+        **drives.options,
         "steering_excitation": NO_EXCITATION,
         "speed_excitation": NO_EXCITATION,
         "segments": 240,
         "steps": 100,
-        **settings.environment.box,
+        **simulate.box,
     }
-    key = jax.random.fold_in(jax.random.key(settings.dataset.seed), LAW_ALONE_STREAM)
+    key = simulate.key(LAW_ALONE_STREAM)
 
     @jax.jit
     def drive(law: PathLaw) -> Trajectory:
-        vehicle = plant._replace(step=step)
+        vehicle = simulate.plant._replace(step=step)
         loop = along_path(vehicle, law, perturbation=perturbation)
         return generate_along_path(loop, key, **options)
 
     def lateral_error(law: PathLaw) -> float:
-        (runs,) = without_faults(settings, drive(law))
+        (runs,) = without_faults(drive(law), simulator=simulate.simulator)
         # A vehicle that leaves its path is lost, however far.
         lateral = jnp.clip(runs.states[..., BODY.start], -LOST_M, LOST_M)
         error = 1e3 * float(jnp.sqrt(jnp.mean(lateral**2)))
@@ -216,13 +230,14 @@ def _lateral_error(
     return lateral_error
 
 
-def without_faults(settings: Settings, runs: Trajectory, *labels: Any) -> Any:
+def without_faults(runs: Trajectory, *labels: Any, simulator: bool) -> Any:
     """Drop the runs in which a simulator failed, and print how many they are.
 
     Args:
-        settings: of the run.
         runs: simulated, (run, …).
         labels: arrays with an entry for each run.
+        simulator: whether the vehicle is one on the host. In a function of jax it is a
+            fault of the vehicle, which others report.
 
     Returns:
         (runs, *labels) without the runs that failed.
@@ -233,9 +248,7 @@ def without_faults(settings: Settings, runs: Trajectory, *labels: Any) -> Any:
     states = np.asarray(runs.states)
     kept = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
     num_failed = len(states) - len(kept)
-    # In a function of jax it is a fault of the vehicle, which others report.
-    has_simulator = bool(getattr(settings.vehicle, "env", None))
-    if not num_failed or not has_simulator:
+    if not num_failed or not simulator:
         return runs, *labels
     failed = f"the simulator failed in {num_failed} of {len(states)} runs"
     if not len(kept):

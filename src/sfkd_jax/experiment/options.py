@@ -19,7 +19,6 @@ from sfkd_jax.build import (
 from sfkd_jax.certification import issue
 from sfkd_jax.certification.corridor import certify_corridor
 from sfkd_jax.plants import KNOWN_STATES, Vehicle, described
-from sfkd_jax.policy import CERTIFICATE
 from sfkd_jax.ranges import (
     Bounds,
     Fraction,
@@ -85,6 +84,16 @@ class DatasetSettings:
     seed: NonNegativeInt = 0
     steps: int = 50
 
+    @property
+    def logs(self) -> LogSettings | None:
+        """These settings if they are of logs; None if the data are simulated."""
+        return self if isinstance(self, LogSettings) else None
+
+    @property
+    def along_path(self) -> AlongPathSettings | None:
+        """These settings if they are of path coordinates; None in the world."""
+        return self if isinstance(self, AlongPathSettings) else None
+
     @classmethod
     def subclass_for(cls, values: Values) -> type[DatasetSettings]:
         """Return the dataclass of logs, of path coordinates or of the world."""
@@ -109,10 +118,11 @@ class SimulatedSettings(DatasetSettings):
 class AlongPathSettings(DatasetSettings):
     """Simulated data in path coordinates, around a law.
 
-    Its drives are of a `DriveClass`, whose fields are settings too.
+    Its drives are of a `DriveClass`, whose fields are settings too. `law` holds
+    `LawSettings`.
     """
 
-    law: LawSettings
+    law: Any
 
     @property
     def options(self) -> dict[str, Any]:
@@ -197,6 +207,19 @@ class EvaluationSettings:
         default_factory=partial(dict.fromkeys, KNOWN_STATES)
     )
     side_forces: Numbers = ()
+
+    def sensors(self, plant: Vehicle) -> tuple[float, ...]:
+        """Return the standard deviations of the sensors of a vehicle, one a state."""
+        noise = self.observation_noise
+        names = plant.state_names
+        # Cars of one comparison may have different ones of the known states.
+        if unknown := set(noise) - {*names, *KNOWN_STATES}:
+            raise ValueError(
+                f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
+                f"the states of the vehicle are {', '.join(names)}"
+            )
+        stated = {name: value for name, value in noise.items() if value is not None}
+        return tuple(stated.get(state.name, state.deviation) for state in plant.states)
 
 
 @takes()
@@ -283,44 +306,6 @@ class Settings:
     demo: DemoSettings
     collect: CollectSettings
 
-    @property
-    def run_dir(self) -> Path:
-        """The directory of the run, root/name/system/seed=N."""
-        return Path(self.root) / self.name / self.model.system / f"seed={self.seed}"
-
-    @property
-    def policy_path(self) -> Path:
-        """The policy of the run, whether or not it exists."""
-        return self.run_dir / "policy.safetensors"
-
-    @property
-    def certificate_path(self) -> Path:
-        """The certificate of the run, whether or not it exists."""
-        return self.run_dir / CERTIFICATE
-
-    def sensors(self, plant: Vehicle) -> tuple[float, ...]:
-        """Return the standard deviations of the sensors of a vehicle, one a state."""
-        noise = self.evaluation.observation_noise
-        names = plant.state_names
-        # Cars of one comparison may have different ones of the known states.
-        if unknown := set(noise) - {*names, *KNOWN_STATES}:
-            raise ValueError(
-                f"evaluation.observation_noise names {', '.join(sorted(unknown))}, "
-                f"the states of the vehicle are {', '.join(names)}"
-            )
-        stated = {name: value for name, value in noise.items() if value is not None}
-        return tuple(stated.get(state.name, state.deviation) for state in plant.states)
-
-    @property
-    def logs(self) -> LogSettings | None:
-        """The settings of logs; None if the data are simulated."""
-        return self.dataset if isinstance(self.dataset, LogSettings) else None
-
-    @property
-    def along_path(self) -> AlongPathSettings | None:
-        """The settings of path coordinates; None for those of the world."""
-        return self.dataset if isinstance(self.dataset, AlongPathSettings) else None
-
 
 def parse_settings(values: Values) -> Settings:
     """Return checked settings; with `environment.source=none` the model reads no e."""
@@ -356,7 +341,7 @@ def _check_estimated(settings: Settings) -> None:
         )
     # Whoever estimates e follows a path, and tells apart what differs.
     why = None
-    if settings.logs:
+    if settings.dataset.logs:
         why = "logs train none"
     elif environment.low and environment.low == environment.high:
         why = f"e is always {environment.low}"

@@ -18,9 +18,8 @@ from sfkd_jax.experiment.options import (
 )
 
 
-def register() -> None:
-    """Put the dataclasses of all groups into Hydra's store, as schemas."""
-    OmegaConf.register_new_resolver("home", os.path.expanduser, replace=True)
+def _schemas() -> dict[tuple[str, str], Any]:
+    """Return the dataclass of every schema, by its group and name."""
     datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
     variants: dict[str, Any] = {
         "vehicle": build.VEHICLES,
@@ -28,16 +27,31 @@ def register() -> None:
         "controller": build.CONTROLLER_SETTINGS,
         "dataset": datasets,
     }
+    schemas = {}
     for group, hint in get_type_hints(Settings).items():
         # The primary config states the values of these commands itself.
         if not is_dataclass(hint) or group in ("demo", "collect"):
             continue
         for variant, dataclass_type in variants.get(group, {"": hint}).items():
-            ConfigStore.instance().store(
-                group=group,
-                name=f"{variant}_schema" if variant else "schema",
-                node=_writable(OmegaConf.structured(dataclass_type)),
+            schemas[group, f"{variant}_schema" if variant else "schema"] = (
+                dataclass_type
             )
+    return schemas
+
+
+SCHEMAS = _schemas()
+"""The dataclass of every schema, by its group and name."""
+
+
+def register() -> None:
+    """Put the dataclasses of all groups into Hydra's store, as schemas."""
+    OmegaConf.register_new_resolver("home", os.path.expanduser, replace=True)
+    for (group, name), dataclass_type in SCHEMAS.items():
+        ConfigStore.instance().store(
+            group=group,
+            name=name,
+            node=_writable(OmegaConf.structured(dataclass_type)),
+        )
 
 
 def _writable(node: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Policy and certificate of a run: loaded if they exist, made if they do not."""
+"""What a run is checked for before it is made, and its certificate."""
 
 from __future__ import annotations
 
@@ -9,26 +9,30 @@ import jax.numpy as jnp
 
 from sfkd_jax import build, policy, store
 from sfkd_jax.certification import CertificationRefused, issue
-from sfkd_jax.certification.corridor import certify_corridor, check_count, closed_loop
+from sfkd_jax.certification.corridor import certify_corridor, closed_loop
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import check_shares
-from sfkd_jax.experiment import data, runs
-from sfkd_jax.experiment.fitting import train_policy
-from sfkd_jax.experiment.options import Settings
-from sfkd_jax.plants import Vehicle, check_step
-from sfkd_jax.ranges import imported
+from sfkd_jax.experiment import data
+from sfkd_jax.experiment.options import (
+    CertificationSettings,
+    EnvironmentSettings,
+    LogSettings,
+)
+from sfkd_jax.experiment.run import Run
+from sfkd_jax.experiment.source import DataSource
 from sfkd_jax.settings import arguments, choose
 from sfkd_jax.types import BODY, Space
 
 
-def check_settings(settings: Settings) -> None:
+def check_settings(run: Run) -> None:
     """Build what the settings choose, with unit scales and without a certificate.
 
     A long run then fails before its first hour, not after it.
     """
-    plant = build.build_vehicle(settings.vehicle)
+    settings = run.settings
+    plant = run.plant
     if plant.simulated:
-        check_step(plant, len(settings.environment.low or (0, 0)))
+        run.source.check_plant()
     check_shares(settings.dataset.shares)
     window = settings.training.window
     if window > settings.dataset.steps:
@@ -36,8 +40,8 @@ def check_settings(settings: Settings) -> None:
             f"training.window={window} does not fit segments "
             f"of dataset.steps={settings.dataset.steps}"
         )
-    sizes = _sizes(settings, plant)
-    law = _zero_law(sizes) if settings.along_path else None
+    sizes = _sizes(run.source)
+    law = _zero_law(sizes) if run.source.along_path else None
     systems = ["self", *build.reference_systems(plant, law)]
     if law is not None:
         systems.extend(build.LAWS_ALONE)
@@ -73,16 +77,16 @@ class _Sizes(NamedTuple):
     env: int
 
 
-def _sizes(settings: Settings, plant: Vehicle) -> _Sizes:
+def _sizes(source: DataSource) -> _Sizes:
     """Return the sizes of what the model reads."""
-    if settings.logs:
-        env = len(settings.logs.columns.environment)
+    if source.logs:
+        env = len(source.logs.columns.environment)
     else:
-        env = len(settings.environment.low or ())
+        env = len(source.environment.low or ())
     # Without a box of e it is friction and wind.
     env = env or 2
-    body = len(plant.state_names) - 3
-    if settings.along_path:
+    body = len(source.plant.states) - 3
+    if source.along_path:
         # e_y and e_ψ in place of the pose; w = (ν, κ, v_ref) has four entries.
         return _Sizes(body=body + 2, control=4, env=env)
     return _Sizes(body=body, control=2, env=env)
@@ -114,46 +118,24 @@ def _zero_law(sizes: _Sizes) -> PathLaw:
     )
 
 
-def ensure_policy(settings: Settings) -> policy.TrainedModel:
-    """Return the policy of the run; train it, or train it on, if it is missing."""
-    # Before the lock and the data: a missing module ends the command at once.
-    if factory := getattr(settings.model, "factory", None):
-        imported(factory, "model.factory")
-    if not settings.policy_path.is_file():
-        # Whether logs are too few for the level is known before the training.
-        if settings.logs:
-            dataset, _ = data.ensure_dataset(settings)
-            count = len(dataset.calibration.controls)
-            check_count(count, settings.certification.level, "calibration segments")
-        with store.locked(settings.run_dir):
-            runs.claim(settings)
-            # Once more under the lock, where nobody else can be writing.
-            if not settings.policy_path.is_file():
-                dataset, data_hash = data.ensure_dataset(settings)
-                train_policy(settings, dataset, data_hash)
-    # Also of a policy that exists: it must have been made with these settings.
-    runs.claim(settings)
-    return policy.restore(settings.run_dir)
-
-
-def certify_policy(settings: Settings) -> dict[str, Any]:
+def certify_policy(run: Run) -> dict[str, Any]:
     """Certify the policy of the run, and write and return the document.
 
     A refusal is a document too: `valid` is false, and `reason` is given.
     """
     began = time.perf_counter()
-    trained = ensure_policy(settings)
+    trained = run.policy
     try:
-        document = _certify_tubes(settings, trained)
+        document = _certify_tubes(run, trained)
     except CertificationRefused as reason:
         document = {"valid": False, "reason": str(reason)}
     document["weights_sha256"] = trained.weights_sha256
     document["policy_sha256"] = trained.sha256
-    document["certification"] = _recorded_certification(settings)
+    document["certification"] = _recorded_certification(run.settings.certification)
     # The proof's own versions win: they are of the libraries that computed it.
     document["versions"] = {**store.versions(), **document.get("versions", {})}
     document["seconds"] = time.perf_counter() - began
-    store.write_json(settings.certificate_path, document)
+    store.write_json(run.certificate_path, document)
     store.print_message(f"certificate: {_verdict(document)}")
     lyapunov_refused = document.get("lyapunov", {}).get("reason")
     if lyapunov_refused:
@@ -176,40 +158,41 @@ def _verdict(document: dict[str, Any]) -> str:
     return verdict
 
 
-def _recorded_certification(settings: Settings) -> dict[str, Any]:
+def _recorded_certification(settings: CertificationSettings) -> dict[str, Any]:
     """Return the settings of the certification that a certificate records."""
-    recorded = store.plain(settings.certification)
+    recorded = store.plain(settings)
     # `renew` says what to do, not what is claimed.
     del recorded["renew"]
     return recorded
 
 
-def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str, Any]:
+def _certify_tubes(run: Run, trained: policy.TrainedModel) -> dict[str, Any]:
     """Certify the steps of a model, with tubes calibrated on the data of the run."""
-    dataset, _ = data.ensure_dataset(settings)
+    dataset = run.source.dataset
     boxes: dict[str, Any] = data.boxes(dataset)
-    if settings.logs:
-        boxes["names"] = _column_names(settings)
+    if logs := run.source.logs:
+        boxes["names"] = _column_names(logs, run.settings.environment)
     document = issue(
         trained.model,
         trained.params,
         validation=dataset.validation,
         calibration=dataset.calibration,
-        held_out=data.held_out_parts(settings, dataset),
+        held_out=run.source.held_out,
         boxes=boxes,
         runs=dataset.runs,
-        **arguments(settings.certification, issue),
+        **arguments(run.settings.certification, issue),
     )
     # Logs have no plant to drive: a corridor needs runs under known conditions.
-    if document["outputs"] and settings.logs is None:
-        document["corridor"] = _measure_corridor(settings, trained, document["outputs"])
+    if document["outputs"] and run.source.logs is None:
+        document["corridor"] = _measure_corridor(run, trained, document["outputs"])
     return document
 
 
-def _column_names(settings: Settings) -> dict[str, Any]:
+def _column_names(
+    logs: LogSettings, environment: EnvironmentSettings
+) -> dict[str, Any]:
     """Return the names of the axes of the boxes, from the columns of the logs."""
-    logs: Any = settings.logs
-    env = logs.columns.environment if settings.environment.is_known else ()
+    env = logs.columns.environment if environment.is_known else ()
     names = {
         "state": logs.columns.state[BODY],
         "control": logs.columns.control,
@@ -219,27 +202,27 @@ def _column_names(settings: Settings) -> dict[str, Any]:
 
 
 def _measure_corridor(
-    settings: Settings, trained: policy.TrainedModel, outputs: Any
+    run: Run, trained: policy.TrainedModel, outputs: Any
 ) -> dict[str, Any]:
     """Return the corridor of a policy, measured on runs of its vehicle.
 
     Args:
-        settings: of the run.
+        run: whose policy it is.
         trained: the policy.
         outputs: the outputs of its certificate.
     """
-    plant = build.build_vehicle(settings.vehicle)
+    settings = run.settings
     loop = closed_loop(
-        plant,
+        run.plant,
         trained.model,
         trained.params,
         trained.law,
-        settings.sensors(plant),
+        run.sensors,
     )
     corridor = certify_corridor(
         loop,
         outputs,
-        {**store.plain(settings.dataset), **settings.environment.box},
+        {**store.plain(settings.dataset), **run.source.box},
         settings.certification.level,
         **arguments(settings.certification.corridor, certify_corridor),
     )
@@ -248,17 +231,18 @@ def _measure_corridor(
     return corridor
 
 
-def ensure_certificate(settings: Settings) -> None:
+def ensure_certificate(run: Run) -> None:
     """Train and certify the policy of the run, unless both exist.
 
     A certificate of other settings of the certification is made again.
     """
     # Another process may be training it.
-    with store.locked(settings.run_dir, wait=True):
-        # Called in any case: it checks that the policy has these settings.
-        ensure_policy(settings)
-        if (path := settings.certificate_path).exists():
+    with store.locked(run.directory, wait=True):
+        # Trained in any case: this checks that the policy has these settings.
+        _ = run.policy
+        if (path := run.certificate_path).exists():
             recorded = store.read_json(path).get("certification", {})
-            if not store.differences(recorded, _recorded_certification(settings)):
+            wanted = _recorded_certification(run.settings.certification)
+            if not store.differences(recorded, wanted):
                 return
-        certify_policy(settings)
+        certify_policy(run)

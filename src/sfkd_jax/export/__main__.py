@@ -5,24 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 from sfkd_jax import policy, store
-from sfkd_jax.experiment import runs
 from sfkd_jax.experiment.command import hydra_command
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.export import write_controller
 from sfkd_jax.settings import arguments
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Export the policy of the run; nothing is trained or certified."""
-    run_dir = settings.run_dir
-    if not (run_dir / "policy.safetensors").is_file():
+    settings = run.settings
+    run_dir = run.directory
+    if not run.policy_path.is_file():
         raise store.ArtefactError(
             f"{run_dir} holds no trained controller; "
             "run train with the same options first"
         )
     folder = run_dir / "export"
     with store.locked(run_dir):
-        runs.claim(settings)
+        run.claim()
         # The weights of the run, the controller of this command.
         trained = policy.load(
             run_dir,
@@ -46,4 +46,4 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -7,13 +7,13 @@ from typing import Any
 
 from sfkd_jax import store
 from sfkd_jax.experiment.command import hydra_command
-from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.run import Run
 from sfkd_jax.report.run import write_report
 
 
-def run(settings: Settings) -> dict[str, Any]:
+def main(run: Run) -> dict[str, Any]:
     """Write the report of the run."""
-    directory = settings.run_dir
+    directory = run.directory
     # A lock would make a directory that does not exist.
     exclusive = store.locked(directory) if directory.exists() else nullcontext()
     with exclusive, store.as_artefact_error(directory):
@@ -23,4 +23,4 @@ def run(settings: Settings) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(run)()
+    hydra_command(main)()

@@ -1,4 +1,4 @@
-"""The directory of a run: what identifies it, its results, and what made them."""
+"""The directory of a run: the settings that made it, its results, and their sources."""
 
 from __future__ import annotations
 
@@ -10,11 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import evaluation, store
-from sfkd_jax.data import Dataset
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import data
-from sfkd_jax.experiment.dataset_files import dataset_config
-from sfkd_jax.experiment.options import Settings
 
 IDENTITY = ("vehicle", "environment", "dataset", "model", "training", "seed")
 """Settings that determine the weights of a run; of the environment, its box."""
@@ -25,69 +21,39 @@ UNREADABLE = frozenset("[]")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def identity(settings: Settings) -> dict[str, Any]:
-    """Return the settings that determine the weights of a run, as plain values."""
-    return {
-        **dataset_config(settings),
-        "model": store.plain(settings.model),
-        "training": store.plain(settings.training),
-        "seed": settings.seed,
-    }
-
-
-def claim(settings: Settings) -> None:
+def claim(run_dir: Path, policy_path: Path, identity: Mapping[str, Any]) -> None:
     """Record the settings of a run in its directory, or check the recorded ones.
 
     The recorded settings of a run that failed before it kept anything are replaced.
+
+    Args:
+        run_dir: of the run.
+        policy_path: of its policy, whether or not it exists.
+        identity: the plain settings that determine its weights.
 
     Raises:
         ArtefactError: the run was made with other settings.
         ValueError: checkpoints could not be read back from this path.
     """
-    run_dir = settings.run_dir
     path = run_dir / "settings.json"
-    wanted = identity(settings)
     if unreadable := UNREADABLE & set(str(path.resolve())):
         raise ValueError(
             "checkpoints cannot be read back from a path "
             f"with {' '.join(sorted(unreadable))}: {path}"
         )
     if path.exists():
-        changed = store.differences(store.read_json(path), wanted)
+        changed = store.differences(store.read_json(path), identity)
         if not changed:
             return
         checkpoints = run_dir / "checkpoints"
         kept = checkpoints.is_dir() and any(checkpoints.iterdir())
         # Without weights the recorded settings made nothing that could be mistaken.
-        if kept or settings.policy_path.is_file():
+        if kept or policy_path.is_file():
             raise store.ArtefactError(
                 f"{run_dir} was made with other settings "
                 f"({'; '.join(changed[:3])}); pass name=… for another run"
             )
-    store.write_json(path, wanted)
-
-
-def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
-    """Return the settings to store with a policy, as plain values.
-
-    Of logged data they include E, and the limits of controls unless the settings of the
-    vehicle state them.
-    """
-    recorded = identity(settings)
-    recorded["controller"] = store.plain(settings.controller)
-    recorded["experiment"] = settings.name
-    if settings.environment.names:
-        recorded["environment"]["names"] = list(settings.environment.names)
-    if settings.logs:
-        # Of logs E is measured, and whoever loads the policy has no logs.
-        box = {"low": dataset.env_low.tolist(), "high": dataset.env_high.tolist()}
-        recorded["environment"] = box
-        vehicle = recorded["vehicle"]
-        if vehicle["name"] == "own" and not vehicle["control_low"]:
-            low, high = data.boxes(dataset)["control"]
-            vehicle["control_low"] = low
-            vehicle["control_high"] = high
-    return recorded
+    store.write_json(path, identity)
 
 
 def read_results(run_dir: Path) -> list[Row]:
