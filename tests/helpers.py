@@ -149,8 +149,8 @@ def explicit(name="sfkd", scale=1.0):
 
 @cache
 def certified(name="sfkd", scale=1.0):
-    """A certificate of such a model, nothing attacked."""
-    return certification.certify(
+    """What is proved of such a model, nothing attacked."""
+    return certification.prove(
         *model_and_params(name, scale), (ENV_LOW, ENV_HIGH), attack_starts=0
     )
 

@@ -31,7 +31,7 @@ def run(settings: Settings) -> dict[str, Any]:
     home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
     plant = build.build_vehicle(settings.vehicle)
     references = build.reference_systems(plant, trained.law)
-    certificate = trained.certificate or {}
+    corridor = trained.certificate.corridor if trained.certificate else None
     systems = {
         trained.settings["model"]["system"]: build.System(
             trained.model,
@@ -50,7 +50,7 @@ def run(settings: Settings) -> dict[str, Any]:
         # The last ones: those of an earlier demo with other settings come before.
         rows = runs.read_results(home)[-len(driven) :]
         store.print_message(text_table(rows, *PRINTED))
-        half_width = certificate.get("corridor", {}).get("corridor_m")
+        half_width = corridor.corridor_m if corridor else None
         path = home.with_name(f"{home.name}.gif")
         film = film_of(path, of_rows(home, rows), half_width)
     seconds = time.perf_counter() - began

@@ -6,6 +6,7 @@ import time
 from typing import Any
 
 from sfkd_jax import build, store
+from sfkd_jax.certificate import Certificate
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
@@ -64,7 +65,8 @@ def _run_stages(settings: Settings) -> dict[str, Any]:
     summary["certificate"] = str(settings.certificate_path)
     summary["results"] = results
     summary["report"] = pages["report"]
-    summary["alpha"] = certificate.get("alpha")
+    is_certified = isinstance(certificate, Certificate)
+    summary["alpha"] = certificate.proof.alpha if is_certified else None
     return summary
 
 

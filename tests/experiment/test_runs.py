@@ -55,7 +55,7 @@ def certified(monkeypatch, tmp_path):
         (first.run_dir / "policy.safetensors").touch()
         document = {
             "valid": True,
-            "certification": stages._recorded_certification(first),
+            "provenance": {"settings": stages._recorded_certification(first)},
         }
         write_json(first.run_dir / "certificate.json", document)
         made.clear()

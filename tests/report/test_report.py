@@ -164,7 +164,7 @@ def test_the_certificate_is_in_words_and_numbers_that_never_round_down(run_page)
     [
         ({"valid": False, "reason": "ρ is 1.2"}, "ρ is 1.2"),
         ({"alpha": 1.0}, "no reason"),
-        ({"weights_sha256": "cd" * 32}, "other weights"),
+        ({"weights": "cd" * 32}, "other weights"),
     ],
 )
 def test_what_is_not_certified_is_said(tmp_path, no_figures, change, reason):

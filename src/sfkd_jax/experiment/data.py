@@ -29,7 +29,7 @@ from sfkd_jax.experiment.laws import closed_loop, without_faults
 from sfkd_jax.experiment.options import LogSettings, Settings
 from sfkd_jax.plants import check_step
 from sfkd_jax.settings import arguments
-from sfkd_jax.types import BODY, Key, Trajectory
+from sfkd_jax.types import Key, Trajectory
 
 DATASET = "dataset"
 """The kind of the file of a data set."""
@@ -156,31 +156,6 @@ def _environment_box(settings: Settings, envs: np.ndarray) -> tuple[Any, Any]:
         return environment_box(envs, None, None, known=False)
     environment = settings.environment
     return environment_box(envs, environment.low, environment.high, known=True)
-
-
-def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
-    """Return the boxes of body state, control and environment: [low, high] of each.
-
-    Those of body state and control are hulls over training and calibration parts; that
-    of the environment is E.
-    """
-    train = dataset.train
-    calibration = dataset.calibration
-    return {
-        "state": _hull(train.states[..., BODY], calibration.states[..., BODY]),
-        "control": _hull(train.controls, calibration.controls),
-        "env": [
-            np.asarray(dataset.env_low).tolist(),
-            np.asarray(dataset.env_high).tolist(),
-        ],
-    }
-
-
-def _hull(*arrays: Any) -> list[list[float]]:
-    """Return the smallest and the largest value of each entry of the last axis."""
-    rows = [np.reshape(array, (-1, array.shape[-1])) for array in arrays]
-    flat = np.concatenate(rows)
-    return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
 
 
 def held_out_parts(settings: Settings, dataset: Dataset) -> dict[str, Trajectory]:

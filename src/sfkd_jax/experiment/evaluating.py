@@ -267,7 +267,8 @@ def _in_lane(
     name: str, system: System, plant: Vehicle, settings: Settings, inner: Controller
 ) -> Controller:
     """Return a controller of scenes around one of references."""
-    if system.law is None or not (system.certificate or {}).get("corridor"):
+    certificate = system.certificate
+    if system.law is None or certificate is None or certificate.corridor is None:
         raise ValueError(
             f"scenario={settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
@@ -276,7 +277,7 @@ def _in_lane(
         inner,
         plant,
         system.law,
-        system.certificate or {},
+        certificate,
         horizon=settings.controller.horizon,
         car=plant.size,
         planner="mppi",
@@ -302,7 +303,7 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
         "episodes": protocol.episodes,
         "episode_s": protocol.episode_s,
         "params": sum(leaf.size for leaf in leaves) or None,
-        "alpha": certificate["alpha"] if certificate else None,
+        "alpha": certificate.proof.alpha if certificate else None,
     }
 
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import evaluation, store
+from sfkd_jax.certification import boxes_of
 from sfkd_jax.data import Dataset
 from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.experiment import data
 from sfkd_jax.experiment.dataset_files import dataset_config
 from sfkd_jax.experiment.options import Settings
 
@@ -84,9 +84,9 @@ def policy_settings(settings: Settings, dataset: Dataset) -> dict[str, Any]:
         recorded["environment"] = box
         vehicle = recorded["vehicle"]
         if vehicle["name"] == "own" and not vehicle["control_low"]:
-            low, high = data.boxes(dataset)["control"]
-            vehicle["control_low"] = low
-            vehicle["control_high"] = high
+            low, high = boxes_of(dataset).control
+            vehicle["control_low"] = list(low)
+            vehicle["control_high"] = list(high)
     return recorded
 
 

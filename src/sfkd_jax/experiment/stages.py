@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.certification import CertificationRefused, issue
-from sfkd_jax.certification.corridor import certify_corridor, check_count, closed_loop
+from sfkd_jax.certificate import (
+    AxisNames,
+    Certificate,
+    Corridor,
+    Proof,
+    Provenance,
+    Refusal,
+    private_key,
+    write,
+)
+from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
+from sfkd_jax.certification.corridor import check_count, closed_loop, measure_corridor
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import check_shares
 from sfkd_jax.experiment import data, runs
@@ -136,98 +148,114 @@ def ensure_policy(settings: Settings) -> policy.TrainedModel:
     return policy.restore(settings.run_dir)
 
 
-def certify_policy(settings: Settings) -> dict[str, Any]:
-    """Certify the policy of the run, and write and return the document.
-
-    A refusal is a document too: `valid` is false, and `reason` is given.
-    """
+def certify_policy(settings: Settings) -> Certificate | Refusal:
+    """Certify the policy of the run, and write and return the certificate."""
     began = time.perf_counter()
+    signing_key = settings.certification.signing_key
+    if signing_key is not None:
+        # Whether it is a key is known before the hours that the rest may take.
+        private_key(signing_key)
     trained = ensure_policy(settings)
+    provenance = Provenance(
+        policy_sha256=trained.sha256,
+        weights_sha256=trained.weights_sha256,
+        versions={**store.versions(), "scipy": version("scipy")},
+        seconds=0.0,
+        settings=_recorded_certification(settings),
+    )
     try:
-        document = _certify_tubes(settings, trained)
+        certificate: Certificate | Refusal = _certify(settings, trained, provenance)
     except CertificationRefused as reason:
-        document = {"valid": False, "reason": str(reason)}
-    document["weights_sha256"] = trained.weights_sha256
-    document["policy_sha256"] = trained.sha256
-    document["certification"] = _recorded_certification(settings)
-    # The proof's own versions win: they are of the libraries that computed it.
-    document["versions"] = {**store.versions(), **document.get("versions", {})}
-    document["seconds"] = time.perf_counter() - began
-    store.write_json(settings.certificate_path, document)
-    store.print_message(f"certificate: {_verdict(document)}")
-    lyapunov_refused = document.get("lyapunov", {}).get("reason")
-    if lyapunov_refused:
-        store.print_message(f"certificate: {lyapunov_refused}")
-    return document
+        certificate = Refusal(reason=str(reason), provenance=provenance)
+    seconds = time.perf_counter() - began
+    provenance = dataclasses.replace(certificate.provenance, seconds=seconds)
+    certificate = dataclasses.replace(certificate, provenance=provenance)
+    write(settings.certificate_path, certificate, signing_key=signing_key)
+    store.print_message(f"certificate: {_verdict(certificate, settings)}")
+    if isinstance(certificate, Certificate) and certificate.proof.lyapunov_refused:
+        store.print_message(f"certificate: {certificate.proof.lyapunov_refused}")
+    return certificate
 
 
-def _verdict(document: dict[str, Any]) -> str:
+def _verdict(certificate: Certificate | Refusal, settings: Settings) -> str:
     """Return what a certificate proves and measures, in one line."""
-    verdict = f"refused: {document.get('reason')}"
-    if document["valid"]:
-        verdict = f"alpha {document['alpha']:.6f}"
-    if corridor := document.get("corridor"):
-        verdict += f"; corridor {corridor['corridor_m']:.3f} m to each side, measured"
-        if "identified_from" in corridor["conditions"]:
+    if isinstance(certificate, Refusal):
+        return f"refused: {certificate.reason}"
+    verdict = f"alpha {certificate.proof.alpha:.6f}"
+    if corridor := certificate.corridor:
+        verdict += f"; corridor {corridor.corridor_m:.3f} m to each side, measured"
+        if corridor.conditions.identified_from is not None:
             verdict += " on the model of the logs, not on the car"
-    if d_bar := document.get("d_bar"):
-        holds = f"holds for {d_bar['holds_for']} (measured, unsigned)"
-        verdict += f"; d_bar {d_bar['value']:.4g} {holds}"
-    return verdict
+    d_bar = certificate.measured.d_bar
+    signature = "signed" if settings.certification.signing_key else "unsigned"
+    holds = f"holds for {d_bar.holds_for} (measured, {signature})"
+    return f"{verdict}; d_bar {d_bar.one_step.latent:.4g} {holds}"
 
 
 def _recorded_certification(settings: Settings) -> dict[str, Any]:
     """Return the settings of the certification that a certificate records."""
     recorded = store.plain(settings.certification)
-    # `renew` says what to do, not what is claimed.
+    # They say what to do, and not what is claimed.
     del recorded["renew"]
+    del recorded["signing_key"]
     return recorded
 
 
-def _certify_tubes(settings: Settings, trained: policy.TrainedModel) -> dict[str, Any]:
-    """Certify the steps of a model, with tubes calibrated on the data of the run."""
+def _certify(
+    settings: Settings, trained: policy.TrainedModel, provenance: Provenance
+) -> Certificate:
+    """Prove, and measure on the data of the run and on runs of its vehicle."""
     dataset, _ = data.ensure_dataset(settings)
-    boxes: dict[str, Any] = data.boxes(dataset)
+    boxes = boxes_of(dataset)
     if settings.logs:
-        boxes["names"] = _column_names(settings)
-    document = issue(
+        boxes = dataclasses.replace(boxes, names=_column_names(settings))
+    began = time.perf_counter()
+    proof = prove(
         trained.model,
         trained.params,
+        boxes.env,
+        validation=dataset.validation,
+        **arguments(settings.certification, prove),
+    )
+    seconds = time.perf_counter() - began
+    measured = measure(
+        trained.model,
+        trained.params,
+        proof,
         validation=dataset.validation,
         calibration=dataset.calibration,
         held_out=data.held_out_parts(settings, dataset),
         boxes=boxes,
         runs=dataset.runs,
-        **arguments(settings.certification, issue),
+        **arguments(settings.certification, measure),
     )
+    corridor = None
     # Logs have no plant to drive: a corridor needs runs under known conditions.
-    if document["outputs"] and settings.logs is None:
-        document["corridor"] = _measure_corridor(settings, trained, document["outputs"])
-    return document
+    if proof.outputs and settings.logs is None:
+        corridor = _measure_corridor(settings, trained, proof)
+    return Certificate(
+        proof=proof,
+        measured=measured,
+        corridor=corridor,
+        provenance=dataclasses.replace(provenance, seconds_proof=seconds),
+    )
 
 
-def _column_names(settings: Settings) -> dict[str, Any]:
+def _column_names(settings: Settings) -> AxisNames:
     """Return the names of the axes of the boxes, from the columns of the logs."""
     logs: Any = settings.logs
     env = logs.columns.environment if settings.environment.is_known else ()
-    names = {
-        "state": logs.columns.state[BODY],
-        "control": logs.columns.control,
-        "env": env,
-    }
-    return store.plain(names)
+    return AxisNames(
+        state=tuple(logs.columns.state[BODY]),
+        control=tuple(logs.columns.control),
+        env=tuple(env),
+    )
 
 
 def _measure_corridor(
-    settings: Settings, trained: policy.TrainedModel, outputs: Any
-) -> dict[str, Any]:
-    """Return the corridor of a policy, measured on runs of its vehicle.
-
-    Args:
-        settings: of the run.
-        trained: the policy.
-        outputs: the outputs of its certificate.
-    """
+    settings: Settings, trained: policy.TrainedModel, proof: Proof
+) -> Corridor:
+    """Return the corridor of a policy, measured on runs of its vehicle."""
     plant = build.build_vehicle(settings.vehicle)
     loop = closed_loop(
         plant,
@@ -236,16 +264,14 @@ def _measure_corridor(
         trained.law,
         settings.sensors(plant),
     )
-    corridor = certify_corridor(
+    return measure_corridor(
         loop,
-        outputs,
+        proof.outputs,
         {**store.plain(settings.dataset), **settings.environment.box},
         settings.certification.level,
-        **arguments(settings.certification.corridor, certify_corridor),
+        identified_from=getattr(settings.vehicle, "contents", None),
+        **arguments(settings.certification.corridor, measure_corridor),
     )
-    if contents := getattr(settings.vehicle, "contents", None):
-        corridor["conditions"]["identified_from"] = contents
-    return corridor
 
 
 def ensure_certificate(settings: Settings) -> None:
@@ -258,7 +284,8 @@ def ensure_certificate(settings: Settings) -> None:
         # Called in any case: it checks that the policy has these settings.
         ensure_policy(settings)
         if (path := settings.certificate_path).exists():
-            recorded = store.read_json(path).get("certification", {})
-            if not store.differences(recorded, _recorded_certification(settings)):
+            recorded = store.read_json(path).get("provenance", {}).get("settings")
+            asked = _recorded_certification(settings)
+            if not store.differences(recorded or {}, asked):
                 return
         certify_policy(settings)
