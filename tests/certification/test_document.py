@@ -1,7 +1,6 @@
-"""The document of a certificate: read, verified, forged and signed."""
+"""The document of a certificate: read, verified and forged."""
 
 import copy
-import hashlib
 import json
 from dataclasses import replace
 from functools import cache
@@ -9,11 +8,11 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import pytest
+from documents import hashed, policy_copy
 from helpers import put, refusal_of
 
-import sfkd_jax
 from sfkd_jax import certificate, policy, store
-from sfkd_jax.certificate import Certificate, parse, read, write
+from sfkd_jax.certificate import parse, read, write
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
@@ -35,13 +34,6 @@ def shipped(name):
 @cache
 def document(name):
     return store.read_json(policy.SHIPPED / name / "certificate.json")
-
-
-def hashed(changed):
-    """As a forger writes it, who knows how the hash is computed."""
-    content = {k: v for k, v in changed.items() if k not in ("sha256", "signature")}
-    text = json.dumps(content, sort_keys=True).encode()
-    return changed | {"sha256": hashlib.sha256(text).hexdigest()}
 
 
 def refusal(changed, name):
@@ -95,35 +87,34 @@ CLAIMED += ("c_1", "c_2", "position", "yaw", "body", "decoder", "lipschitz")
 """Bounds, which a forger makes smaller."""
 
 
-def lies(path, value):
-    """Values of the same type that claim more than is proved."""
+def lie(path, value):
+    """A value of the same type that claims more than is proved."""
     *_, key = path.split(".")
     if isinstance(value, str):
-        return [f"{value} for all cars", ""]
+        return f"{value} for all cars"
     if value is None:
-        return ["there is none"] if key == "lyapunov_refused" else [0.5]
+        return "there is none" if key == "lyapunov_refused" else 0.5
     if "attacks" in path or key == "tightness":
-        return [1e3, -1e-9]
-    if key in CLAIMED:
-        return [0.99 * value, -value]
+        return 1e3
     if "env_box" in path:
-        return [2.0 * value]
-    # Of a witness: a multiplier, or an entry of P.
-    return [-value, 1e6] if key != "transport_lipschitz" else [0.9, 1.1]
+        return 2.0 * value
+    # Else of a witness: a multiplier, or an entry of P.
+    is_bound = key in CLAIMED or key == "transport_lipschitz"
+    return 0.99 * value if is_bound else -value
 
 
 @pytest.mark.parametrize("name", FORGED)
 def test_the_core_refuses_every_changed_entry_of_a_proof(name, few_weights):
     """Although the forger computes the hash again."""
     honest = document(name)
-    tried, accepted = 0, []
-    for path, value in leaves(honest["proof"], "proof"):
-        for lie in lies(path, value):
-            tried += 1
-            if refusal(hashed(put(honest, path, lie)), name) is None:
-                accepted.append((path, lie))
+    entries = [*leaves(honest["proof"], "proof")]
+    accepted = [
+        path
+        for path, value in entries
+        if refusal(hashed(put(honest, path, lie(path, value))), name) is None
+    ]
     assert accepted == []
-    assert tried > 40
+    assert len(entries) > 30
 
 
 @pytest.mark.parametrize("name", FORGED)
@@ -132,12 +123,11 @@ def test_a_changed_entry_is_refused_while_the_hash_is_that_of_before(name):
     parts = {k: honest[k] for k in ("measured", "corridor", "provenance") if honest[k]}
     tried = 0
     for path, value in leaves(parts):
-        for lie in (f"{value}_" if isinstance(value, str) else 1.5, None, True):
-            if lie != value:
-                tried += 1
-                with pytest.raises(ValueError, match="changed since it was written"):
-                    parse(put(honest, path, lie))
-    assert tried > 100
+        tried += 1
+        changed = put(honest, path, f"{value}_" if isinstance(value, str) else -1.5)
+        with pytest.raises(ValueError, match="changed since it was written"):
+            parse(changed)
+    assert tried > 40
 
 
 @pytest.mark.parametrize(
@@ -259,21 +249,11 @@ def copied(tmp_path):
     return policy_copy(tmp_path, "kinematic")
 
 
-def policy_copy(tmp_path, name):
-    run = tmp_path / "run"
-    run.mkdir()
-    for file in (policy.SHIPPED / name).iterdir():
-        (run / file.name).write_bytes(file.read_bytes())
-    return run
-
-
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("space.body_scale.0", 5.0),
         ("vehicle.mass", 1600.0),
         ("controller.cost.lateral", 2.0),
-        ("model.transport", False),
     ],
 )
 def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
@@ -326,133 +306,3 @@ def test_the_reason_of_a_refusal_is_told_in_one_printable_line(copied):
     assert read(copied / "certificate.json") == refused
     with pytest.warns(UserWarning, match=r"was refused: no bound\\x1b\[31m$"):
         policy.load(copied)
-
-
-# --- signatures -----------------------------------------------------------------------
-
-
-def new_key(folder, name):
-    """Write a private and a public key, and return their paths."""
-    ed25519 = pytest.importorskip(
-        "cryptography.hazmat.primitives.asymmetric.ed25519", exc_type=ImportError
-    )
-    from cryptography.hazmat.primitives import serialization as form
-
-    key = ed25519.Ed25519PrivateKey.generate()
-    private = key.private_bytes(
-        form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption()
-    )
-    public = key.public_key().public_bytes(
-        form.Encoding.PEM, form.PublicFormat.SubjectPublicKeyInfo
-    )
-    (folder / f"{name}.pem").write_bytes(private)
-    (folder / f"{name}.public.pem").write_bytes(public)
-    return folder / f"{name}.pem", folder / f"{name}.public.pem"
-
-
-@pytest.fixture
-def keys(tmp_path):
-    return new_key(tmp_path, "mine")
-
-
-@pytest.fixture
-def signed(tmp_path, keys):
-    """A run directory whose certificate is signed with `keys`."""
-    run = policy_copy(tmp_path, "dynamic_path")
-    path = run / "certificate.json"
-    write(path, read(path), signing_key=str(keys[0]))
-    return run
-
-
-def test_a_signed_certificate_loads_with_its_key_and_says_who_signed(signed, keys):
-    loaded = sfkd_jax.load(signed, signed_by=keys[1])
-    key = certificate.public_key_of(keys[1])
-    assert loaded.signature == f"signed by {key}"
-    assert f"measured, signed by {key}: d_bar" in repr(loaded)
-    assert sfkd_jax.load(signed, signed_by=key.upper()).signature == loaded.signature
-    assert sfkd_jax.load(signed).signature == loaded.signature
-
-
-def test_a_signature_stays_with_what_it_is_about_alone(signed, keys):
-    path = signed / "certificate.json"
-    original = read(path)
-    write(path, original)
-    assert read(path) == original
-    narrow = replace(original.corridor, seconds=0.0)
-    write(path, replace(original, corridor=narrow))
-    assert read(path).signature is None
-
-
-def forge(run):
-    """Claim a corridor of a micrometre, with the hash that belongs to it."""
-    path = run / "certificate.json"
-    forged = store.read_json(path)
-    bounds = forged["corridor"]["bounds"]
-    bounds |= {"nominal": 5e-7, "vehicle_to_nominal_position": 5e-7}
-    forged["corridor"]["corridor_m"] = 1e-6
-    path.write_text(json.dumps(hashed(forged)))
-
-
-def test_a_forged_corridor_loads_unsigned_and_with_no_key(tmp_path, keys):
-    run = policy_copy(tmp_path, "dynamic_path")
-    forge(run)
-    loaded = sfkd_jax.load(run)
-    assert loaded.certificate.corridor.corridor_m == 1e-6
-    assert loaded.signature == "unsigned"
-    assert "measured, unsigned: d_bar" in repr(loaded)
-    line = refusal_of(lambda: sfkd_jax.load(run, signed_by=keys[1]))
-    assert "is not signed, and was to be signed by" in line
-
-
-def test_what_was_signed_and_changed_is_refused_with_and_without_a_key(signed, keys):
-    forge(signed)
-    for key in (keys[1], None):
-        line = refusal_of(lambda key=key: sfkd_jax.load(signed, signed_by=key))
-        assert "the signature is not that of" in line
-
-
-def test_another_signer_is_refused(signed, tmp_path):
-    _, other = new_key(tmp_path, "other")
-    line = refusal_of(lambda: sfkd_jax.load(signed, signed_by=other))
-    assert "is signed by" in line
-    assert f"not by {certificate.public_key_of(other)}" in line
-
-
-def test_a_policy_that_a_signature_is_not_about_is_refused(signed, keys):
-    (signed / "policy.safetensors").write_bytes(
-        (policy.SHIPPED / "kinematic_path" / "policy.safetensors").read_bytes()
-    )
-    line = refusal_of(lambda: sfkd_jax.load(signed, signed_by=keys[1]))
-    assert "about other weights or settings" in line
-    (signed / "certificate.json").unlink()
-    line = refusal_of(lambda: sfkd_jax.load(signed, signed_by=keys[1]))
-    assert "is missing, and was to be signed" in line
-
-
-@pytest.mark.parametrize("value", ["", "00", "zz", "0" * 128])
-def test_a_damaged_signature_is_refused_in_one_line(signed, keys, value):
-    path = signed / "certificate.json"
-    path.write_text(json.dumps(put(store.read_json(path), "signature.value", value)))
-    line = refusal_of(lambda: sfkd_jax.load(signed, signed_by=keys[1]))
-    assert "the signature is not that of" in line
-
-
-def test_files_that_are_no_keys_are_refused_in_one_line(keys, tmp_path):
-    private, public = keys
-    honest = read(policy.SHIPPED / "kinematic" / "certificate.json")
-    for file in (public, tmp_path / "missing.pem"):
-        line = refusal_of(
-            lambda file=file: write(tmp_path / "c.json", honest, signing_key=str(file))
-        )
-        assert file.name in line
-    assert private.name in refusal_of(lambda: certificate.public_key_of(private))
-    assert not (tmp_path / "c.json").exists()
-
-
-def test_without_cryptography_a_signature_is_not_believed(monkeypatch):
-    monkeypatch.setattr(certificate._signature, "can_check", lambda: False)
-    name = certificate.Signature(public_key="ab" * 32, value="00")
-    assert "which is not checked" in certificate.describe_signature("00", name)
-    with pytest.raises(ValueError, match=r"sfkd-jax\[sign\]"):
-        sfkd_jax.load("kinematic", signed_by="ab" * 32)
-    assert isinstance(sfkd_jax.load("kinematic").certificate, Certificate)

@@ -178,6 +178,17 @@ def test_what_is_not_certified_is_said(tmp_path, no_figures, change, reason):
     assert "0.1431" not in text
 
 
+def test_the_page_believes_no_signature_that_it_has_not_checked(tmp_path, no_figures):
+    signature = {"public_key": "ab" * 32, "value": "00"}
+    run = made.write_run(
+        tmp_path, episodes=False, certificate=made.certificate(signature=signature)
+    )
+    write_report(run)
+    text = words(run / "report")
+    assert f"measured, signed by {'ab' * 32} |" not in text
+    assert "which is not checked" in text or "measured, unsigned: the signature" in text
+
+
 def test_a_page_of_a_new_run_names_the_commands_that_come_next(tmp_path, no_figures):
     run = made.write_run(
         tmp_path, episodes=False, results=None, certificate=None, open_loop=None
