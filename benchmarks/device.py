@@ -188,7 +188,7 @@ def episodes(name, samples, count, seed):
         lateral = np.abs(many(keys))
         seconds.append(time.perf_counter() - began)
     largest = lateral.max(axis=1)
-    width = policy.certificate["corridor"]["corridor_m"]
+    width = policy.certificate.corridor.corridor_m
     return {
         "episodes": count,
         "seconds": seconds[1],

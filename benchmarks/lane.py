@@ -185,7 +185,7 @@ def counted(car, made):
         "steps": gap.size,
         "in_domain": shown(np.isfinite(claim).mean(), 4),
         "worst_lateral_m": shown(np.where(np.isfinite(claim), far, 0.0).max()),
-        "corridor_m": shown(car.policy.certificate["corridor"]["corridor_m"]),
+        "corridor_m": shown(car.policy.certificate.corridor.corridor_m),
         "smallest_clearance_m": shown(nearest.min()),
         "mean_speed": shown(made["speed"].mean(), 2),
         "progress_m": shown(made["along"][:, -1].mean(), 1),

@@ -12,7 +12,7 @@ from benchmarks import PRETRAINED, ROOT, is_old
 from benchmarks.tables import Measured, measured, table
 from experiments import results
 from experiments.simulator import PREFIXES
-from sfkd_jax import store
+from sfkd_jax import certificate, store
 
 CARS = ("dynamic", "kinematic")
 NONE = "–"
@@ -68,19 +68,19 @@ def claims():
     found = []
     for car in CARS:
         folder = PRETRAINED / policy_of(car)
-        certificate = read(folder / "certificate.json")
+        claimed = certificate.read(folder / "certificate.json")
         _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
-        about = certificate["corridor"]
+        about = claimed.corridor
         numbers = {
-            "corridor_m": about["corridor_m"],
-            "coverage": about["coverage"],
-            "coverage_ci95": about["coverage_ci95"],
-            "coverage_s3": about["by_scenario"]["s3"]["coverage"],
-            "alpha": certificate["outputs"]["position"]["alpha"],
+            "corridor_m": about.corridor_m,
+            "coverage": about.coverage.share,
+            "coverage_ci95": about.coverage.ci95,
+            "coverage_s3": about.by_scenario["s3"].share,
+            "alpha": claimed.proof.outputs["position"].alpha,
         }
-        for group, counted in about["by_group"].items():
-            numbers[f"coverage_{group}"] = counted["coverage"]
-        old = certificate["policy_sha256"] != manifest["content_sha256"]
+        for group, counted in about.by_group.items():
+            numbers[f"coverage_{group}"] = counted.coverage.share
+        old = claimed.provenance.policy_sha256 != manifest["content_sha256"]
         found.append((numbers, old))
     foreign = read("experiments/simulator.json")
     found.append((foreign, is_old(foreign)))

@@ -112,7 +112,7 @@ class Car:
         self.name = name
         self.batch = batch
         self.step = getattr(plants, name)(dt=TICK, substeps=1).step
-        self.corridor = self.loaded.certificate["corridor"]["corridor_m"]
+        self.corridor = self.loaded.certificate.corridor.corridor_m
         self.states = len(self.loaded.vehicle.state_names)
         self.noise = np.asarray(self.loaded.vehicle.sensor_noise, np.float32)
         self.room = room_in_lane(self.loaded.vehicle.size)
@@ -387,7 +387,7 @@ def starts(car, most):
     seen = seen[:most]
     many = min(most, 2000)
     random = np.random.default_rng(3)
-    low, high = np.asarray(car.loaded.certificate["boxes"]["state"])[:, 3:]
+    low, high = np.asarray(car.loaded.certificate.measured.boxes.state)[:, 3:]
     beside = random.uniform(
         (-20.0, -np.pi, 2.0, *low), (20.0, np.pi, 12.0, *high), (many, 3 + len(low))
     )
@@ -523,8 +523,10 @@ def deceptions(steps):
 
 def in_class(car, many, seed=6):
     """Runs under the conditions of the certificate."""
-    about = car.loaded.certificate["corridor"]["conditions"]
-    limits = scenarios.DriveClass(*(about[x] for x in scenarios.DriveClass._fields))
+    about = car.loaded.certificate.corridor.conditions
+    limits = scenarios.DriveClass(
+        *(getattr(about, x) for x in scenarios.DriveClass._fields)
+    )
     length = {"steps": LONGEST, "dt": PERIOD}
     drive = partial(scenarios.random_drive, limits=limits, **length)
     keys = jax.random.split(jax.random.key(seed), many)
@@ -535,8 +537,8 @@ def in_class(car, many, seed=6):
         np.interp(SPACING * np.arange(POINTS), *one)
         for one in zip(along, turns, strict=True)
     ]
-    low, high = about["env_box"]
-    box = {"low": low, "high": high, "dwell": about["dwell_s"]}
+    low, high = about.env_box
+    box = {"low": low, "high": high, "dwell": about.dwell_s}
     switching = partial(scenarios.random_switching, **length, **box)
     road = roads(many, seed, switching, np.stack(bends))
     return runs_on(car, road, LONGEST, seed, speed=speeds)
@@ -553,10 +555,10 @@ def detection_rows(car, most):
     random = np.random.default_rng(11)
     runs = in_class(car, many, seed=11)
     runs = runs._replace(now=jax.tree.map(lambda x: x[:, :steps], runs.now))
-    about = car.loaded.certificate["corridor"]["conditions"]
+    about = car.loaded.certificate.corridor.conditions
     # As in the data: an AR(1) process, for a quarter of the runs its sign.
-    ends = np.log([about["steering_excitation"], about["speed_excitation"]])
-    sizes = np.exp(random.uniform(*ends.T, (many, 1, 2))) / about["perturbation"]
+    ends = np.log([about.steering_excitation, about.speed_excitation])
+    sizes = np.exp(random.uniform(*ends.T, (many, 1, 2))) / about.perturbation
     noise = lfilter([0.527], [1, -0.85], random.normal(size=(many, steps, 2)), axis=1)
     noise = np.where(random.uniform(size=(many, 1, 1)) < 0.25, np.sign(noise), noise)
     nu = np.clip(sizes * noise, -1.0, 1.0).astype(np.float32)

@@ -140,7 +140,7 @@ def collect(plant, step, gain, runs: int) -> Dataset:
 
 
 def learn(data: Dataset, steps: int, horizon: int):
-    """Return the model, its weights, and its certificate, which has been verified."""
+    """Return the model, its weights, what is proved of it, and what is measured."""
     # No pose moves: none is to be learned.
     space = measure_space(data)._replace(increment_scale=jnp.full(3, 1e-6))
     model = models.sfkd(
@@ -158,22 +158,24 @@ def learn(data: Dataset, steps: int, horizon: int):
             steps=steps,
             learning_rate=0.01,
         )
-    document = certification.issue(
+    boxes = certification.boxes_of(data)
+    proof = certification.prove(
+        model, params, boxes.env, validation=data.validation, attack_starts=0
+    )
+    # Checked again, from its witnesses.
+    certification.verify_proof(proof, model, params)
+    measured = certification.measure(
         model,
         params,
+        proof,
         validation=data.validation,
         calibration=data.calibration,
         held_out={"test": data.test},
-        boxes={"env": (ENV_LOW, ENV_HIGH)},
+        boxes=boxes,
         horizon=horizon,
         level=0.9,
-        attack_starts=0,
     )
-    # The proof is checked again, from its witnesses.
-    certification.verify(
-        certification.Certificate.from_document(document), params, model=model
-    )
-    return model, params, document
+    return model, params, proof, measured
 
 
 def stage(weights, state, v, v_before, target):
@@ -289,12 +291,12 @@ def follow(driver, physics, state, *, dt: float, horizon: int, seconds: float):
     }
 
 
-def print_certificate(document, horizon: int) -> None:
+def print_certificate(proof, measured, horizon: int) -> None:
     """Print the certified rate and how far the body state may stray."""
-    tube = document["tube"]["physical"]["body"]
+    tube = measured.tube.physical["body"]
     print(
-        f"certified: alpha {document['alpha']:.4f}; "
-        f"an attack reaches {document['attacks']['step_slopes']:.4f}"
+        f"certified: alpha {proof.alpha:.4f}; "
+        f"an attack reaches {proof.attacks['step_slopes']:.4f}"
     )
     print(
         f"tube of the body state: {tube[0]:.3f} after one step, "
@@ -310,14 +312,14 @@ def main(
     horizon: int = 25,
     seconds: float = 12.0,
 ):
-    """Train, certify and drive; return the certificate, and a row a controller."""
+    """Train, certify and drive; return what is proved and measured, and the rows."""
     environment = envs.get_environment("inverted_pendulum", backend="generalized")
     plant = adapters.brax_plant(environment)
     gain = upright_gain(plant)
     step = under_gain(plant)
     data = collect(plant, step, gain, runs)
-    model, params, document = learn(data, steps, horizon)
-    print_certificate(document, horizon)
+    model, params, proof, measured = learn(data, steps, horizon)
+    print_certificate(proof, measured, horizon)
 
     # What depends on the weights alone is computed once, not at every step.
     params = jax.jit(partial(fold, model))(params)
@@ -335,7 +337,7 @@ def main(
         angle = f"angle up to {row['angle_rad']:.3f} rad, {end}"
         print(f"{name:24} RMS cart error {row['rms_m']:.3f} m, {angle}", flush=True)
         rows[name] = row
-    return {"certificate": document, "rows": rows}
+    return {"proof": proof, "measured": measured, "rows": rows}
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def compile_drive(policy):
     """Return the compiled function (scene, key) -> episode of a policy in its lane."""
     plant = policy.vehicle
     controller = policy.in_lane()
-    sensor_noise = policy.certificate["corridor"]["conditions"]["sensor_noise"]
+    sensor_noise = policy.certificate.corridor.conditions.sensor_noise
 
     def drive(scene, key):
         return evaluation.simulate(
@@ -115,7 +115,7 @@ def main(runs=1, seed=0, vehicle="dynamic", film="lane.gif"):
     picture = films.LaneFilm(scene, episode, dt=plant.dt, car=plant.size.half)
     films.write(Path(film), picture)
 
-    summary = summarise(stacked, policy.certificate["corridor"]["corridor_m"])
+    summary = summarise(stacked, policy.certificate.corridor.corridor_m)
     return {name: float(value) for name, value in summary.items()}
 
 

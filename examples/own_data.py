@@ -132,7 +132,7 @@ def main(
             log_some_runs(path, runs)
         data = read(path)
         model, params = train(data, steps, Path(scratch) / "run")
-    proof = certification.certify(
+    proof = certification.prove(
         model, params, (data.env_low, data.env_high), attack_starts=0
     )
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import stamp
+from sfkd_jax import certificate
 
 PREFIXES = {
     "nominal": "nominal_mppi_",
@@ -26,13 +27,15 @@ PREFIXES = {
 def main():
     """Print the line."""
     runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
-    certificate = json.loads((runs[0] / "certificate.json").read_text("utf-8"))
-    corridor = certificate["corridor"]
+    claimed = certificate.read(runs[0] / "certificate.json")
+    corridor = claimed.corridor
     found = {
-        name: corridor[name] for name in ("corridor_m", "coverage", "coverage_ci95")
+        "corridor_m": corridor.corridor_m,
+        "coverage": corridor.coverage.share,
+        "coverage_ci95": corridor.coverage.ci95,
+        "coverage_s3": corridor.by_scenario["s3"].share,
+        "alpha": claimed.proof.outputs["position"].alpha,
     }
-    found["coverage_s3"] = corridor["by_scenario"]["s3"]["coverage"]
-    found["alpha"] = certificate["outputs"]["position"]["alpha"]
     for run in runs:
         for row in json.loads((run / "results.json").read_text("utf-8"))["rows"]:
             estimated = row["env"] == "estimated"

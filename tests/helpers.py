@@ -149,8 +149,8 @@ def explicit(name="sfkd", scale=1.0):
 
 @cache
 def certified(name="sfkd", scale=1.0):
-    """A certificate of such a model, nothing attacked."""
-    return certification.certify(
+    """What is proved of such a model, nothing attacked."""
+    return certification.prove(
         *model_and_params(name, scale), (ENV_LOW, ENV_HIGH), attack_starts=0
     )
 
@@ -318,11 +318,9 @@ def refusal_of(action):
 
 
 def put(document, path, value):
-    """A copy with the value at a dotted path replaced."""
-    changed = copy.deepcopy(document)
-    *above, last = path.split(".")
-    inner = changed
-    for key in above:
-        inner = inner[int(key) if isinstance(inner, list) else key]
-    inner[int(last) if isinstance(inner, list) else last] = value
+    """The same with the value at a dotted path replaced; the document stays as it is."""
+    key, _, below = path.partition(".")
+    changed = copy.copy(document)
+    key = int(key) if isinstance(document, list) else key
+    changed[key] = put(document[key], below, value) if below else value
     return changed

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from benchmarks import pages
+from sfkd_jax import certificate
 
 ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "sfkd_jax"
@@ -151,8 +152,8 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
 
 
 def test_every_table_of_numbers_is_made_from_a_committed_result():
-    claims = pages.read(pages.PRETRAINED / "kinematic_path/certificate.json")
-    enemy = claims["corridor"]["attack"]["shielded_lateral_m"]
+    claims = certificate.read(pages.PRETRAINED / "kinematic_path/certificate.json")
+    enemy = claims.corridor.attack.shielded_lateral_m
     limit = f"got the kinematic car {enemy:.1f} m aside"
     found = pages.read("experiments/simulator.json")
     errors = "{estimated_rmse_mm} mm in place of {rmse_mm}".format(**found)

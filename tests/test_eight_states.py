@@ -106,7 +106,7 @@ def test_a_policy_of_it_says_its_names_and_units():
     environment = shipped.settings["environment"] | {"source": "measured"}
     told = {**shipped.settings, "environment": environment}
     trained = replace(shipped, vehicle=electric(), settings=told)
-    text = policy.describe(trained, None)
+    text = policy.describe(trained, None, "unsigned")
     assert "steering [rad], charge [kWh]" in text
     assert policy.interface_of(trained, None)["observation"][-1] == "charge"
 

@@ -91,11 +91,10 @@ def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch):
     """
     sizes = {"runs": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
     result = example("brax_pendulum", monkeypatch)["main"](**sizes)
-    proof = result["certificate"]
+    proof = result["proof"]
     rows = result["rows"]
-    assert proof["valid"]
-    assert proof["attacks"]["step_slopes"] <= proof["alpha"] < 1.0
-    assert len(proof["tube"]["latent"]) == 20
+    assert proof.attacks["step_slopes"] <= proof.alpha < 1.0
+    assert len(result["measured"].tube.latent) == 20
     assert np.isfinite(rows["SFKD"]["rms_m"])
     # e is 1 for the first three seconds.
     assert rows["SFKD"] == rows["SFKD, given e = 1"]

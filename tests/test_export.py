@@ -25,6 +25,7 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 import sfkd_jax
 from sfkd_jax import build, certification, policy, store
 from sfkd_jax import export as exporting
+from sfkd_jax.certificate import Boxes, Certificate, Provenance, Refusal, read, write
 from sfkd_jax.export import __main__ as export
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
@@ -39,11 +40,11 @@ SMALL = (
     *("model.encoder_hidden=8", "model.embedding=4"),
     *("controller.mppi.num_samples=16", f"controller.mppi.horizon={HORIZON}"),
 )
-BOXES = {
-    "state": [[0.0], [20.0]],
-    "control": [[-0.5, -5.0], [0.5, 5.0]],
-    "env": [list(ENV_LOW), list(ENV_HIGH)],
-}
+BOXES = Boxes(
+    state=((0.0,), (20.0,)),
+    control=((-0.5, -5.0), (0.5, 5.0)),
+    env=(ENV_LOW, ENV_HIGH),
+)
 HEAVY = {"sfkd_jax", "flax", "hydra", "optax", "jaxtyping", "matplotlib", "iree"}
 
 
@@ -72,13 +73,28 @@ def exported(tmp_path_factory):
         "calibration": data.calibration,
         "held_out": dict.fromkeys(("test", "uniform", "s3"), data.test),
     }
-    certificate = certification.issue(
-        trained.model, trained.params, **splits, boxes=BOXES, level=0.9, attack_starts=0
+    proof = certification.prove(
+        trained.model,
+        trained.params,
+        BOXES.env,
+        validation=data.validation,
+        attack_starts=0,
     )
-    certificate["versions"] |= store.versions()
-    certificate["weights_sha256"] = trained.weights_sha256
-    certificate["policy_sha256"] = trained.sha256
-    store.write_json(run_dir / "certificate.json", certificate)
+    measured = certification.measure(
+        trained.model, trained.params, proof, **splits, boxes=BOXES, level=0.9
+    )
+    provenance = Provenance(
+        policy_sha256=trained.sha256,
+        weights_sha256=trained.weights_sha256,
+        versions=store.versions(),
+        seconds=0.0,
+    )
+    write(
+        run_dir / "certificate.json",
+        Certificate(
+            proof=proof, measured=measured, corridor=None, provenance=provenance
+        ),
+    )
     return requested, export.main(requested)
 
 
@@ -297,7 +313,7 @@ def test_the_manifest_lists_the_inputs_of_programs_and_what_they_were_made_from(
     highest = tuple(control["high"] for control in manifest["controls"])
     assert highest == requested.plant.control_high
     assert manifest["environment"]["low"] == list(ENV_LOW)
-    assert loaded.certificate["boxes"] == BOXES
+    assert loaded.certificate.measured.boxes == BOXES
 
 
 def test_an_export_does_not_contain_paths_of_this_machine(exported):
@@ -323,9 +339,9 @@ def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
     requested = run(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
     run_dir = requested.directory
     assert (run_dir / "export" / "certificate.json").exists()
-    store.write_json(
-        run_dir / "certificate.json", {"valid": False, "reason": "alpha is not below 1"}
-    )
+    provenance = read(run_dir / "certificate.json").provenance
+    refusal = Refusal(reason="alpha is not below 1", provenance=provenance)
+    write(run_dir / "certificate.json", refusal)
     printed = export.main(requested)
     assert "exported without a certificate" in capsys.readouterr().err
     manifest = json.loads(Path(printed["manifest"]).read_text())

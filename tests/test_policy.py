@@ -57,13 +57,13 @@ def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
     for fact in ("p_x [m]", "steering [rad] -0.5 … 0.5", "-6 … 3", "-8 … 8"):
         assert fact in text
     (proved,) = (line for line in text.splitlines() if "proved" in line)
-    (measured,) = (line for line in text.splitlines() if "not signed" in line)
-    assert f"alpha {document['alpha']:.4f}" in proved
-    assert f"{document['d_bar']['value']:.3g}" in measured
+    (measured,) = (line for line in text.splitlines() if "measured, unsigned" in line)
+    assert f"alpha {document.proof.alpha:.4f}" in proved
+    assert f"{document.measured.d_bar.one_step.latent:.3g}" in measured
     if "_" in vehicle:
         for fact in ("v_ref [m/s] 3 … 12", "curvature [1/m] -0.05 … 0.05", "3 to 6 s"):
             assert fact in text
-        assert f"{document['corridor']['corridor_m']:.3f} m" in measured
+        assert f"{document.corridor.corridor_m:.3f} m" in measured
     assert "nothing is proved" in repr(replace(trained, certificate=None))
 
 
@@ -156,7 +156,7 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
 
     lateral, info = drive(controls)
     worst = np.max(np.abs(lateral), axis=1)
-    assert np.all(worst <= trained.certificate["corridor"]["corridor_m"]), worst
+    assert np.all(worst <= trained.certificate.corridor.corridor_m), worst
     assert not np.any(info.healthy[0])
     assert np.all(worst[2:4] > 0.02)  # as far as the filter lets them
     assert info.planner["mine"].shape == lateral.shape

@@ -10,6 +10,7 @@ import pytest
 import benchmarks
 from benchmarks import pages, tables
 from experiments import results
+from sfkd_jax import certificate
 
 PAGE = (results.HOME.parent / "docs" / "results.md").read_text("utf-8")
 PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
@@ -68,9 +69,9 @@ DRIVEN = ("dynamic", 0.104, 6.8), ("kinematic", 0.291, 13.3)
 @pytest.mark.parametrize(("plant", "corridor", "error"), DRIVEN)
 def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error):
     path = PRETRAINED / f"{plant}_path" / "certificate.json"
-    claims = json.loads(path.read_text("utf-8"))["corridor"]
-    assert round(claims["corridor_m"], 3) == corridor
-    assert claims["coverage"] >= 0.93
+    claims = certificate.read(path).corridor
+    assert round(claims.corridor_m, 3) == corridor
+    assert claims.coverage.share >= 0.93
     sfkd, oracle = (
         np.mean(row("corridor", "s3", label, plant)["rmse_mm"])
         for label in ("sfkd", "oracle")

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,6 +15,7 @@ from helpers import last_line, run_command
 
 import sfkd_jax
 from sfkd_jax import build, collect, evaluate, plants
+from sfkd_jax.certificate import write
 from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.store import ArtefactError
@@ -82,7 +84,8 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     assert len(fitted) == len(errors["position_rmse_m"]) == 5
     certificate = json.loads((logs.parent / document["certificate"]).read_text())
     assert certificate["valid"]
-    assert certificate["boxes"]["names"] == {
+    boxes = certificate["measured"]["boxes"]
+    assert boxes["names"] == {
         "state": ["v", "yaw_rate"],
         "control": ["steering", "acceleration"],
         "env": [],
@@ -91,7 +94,7 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     policy = sfkd_jax.load(logs.parent / document["run"])
     assert policy.certificate is not None
     limits = [policy.settings["vehicle"][f"control_{side}"] for side in ("low", "high")]
-    assert limits == certificate["boxes"]["control"]
+    assert limits == boxes["control"]
     assert not {"path"} & set(policy.settings["dataset"])
 
 
@@ -239,16 +242,17 @@ def test_runs_of_the_car_calibrate_its_corridor_again(under_policy, capsys):
     assert re.search(says, capsys.readouterr().err)
     folder = Path(made["certificate"]).parent
     policy = sfkd_jax.load(folder)
-    claim = policy.certificate["recorded"]
-    before = policy.certificate["corridor"]["bounds"]["nominal"]
-    assert claim["bounds"]["nominal"] >= before
+    corridor = policy.certificate.corridor
+    claim = corridor.recorded
+    assert claim.bounds.nominal >= corridor.bounds.nominal
     assert made["conditions"]["lateral_m"] <= made["corridor_m"]
     assert "of 5 runs of the car" in repr(policy)
     collected(under_policy)
     assert "is replaced" in capsys.readouterr().err
-    forged = policy.certificate | {"recorded": claim | {"corridor_m": 0.01}}
-    Path(made["certificate"]).write_text(json.dumps(forged))
-    with pytest.raises(ArtefactError, match=r"recorded\.corridor_m does not follow"):
+    narrower = replace(corridor, recorded=replace(claim, corridor_m=0.01))
+    forged = replace(policy.certificate, corridor=narrower)
+    write(Path(made["certificate"]), forged)
+    with pytest.raises(ArtefactError, match=r"corridor_m does not follow"):
         sfkd_jax.load(folder)
     Path(made["certificate"]).unlink()
 

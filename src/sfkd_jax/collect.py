@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import certificate as certificates
+from sfkd_jax import policy, store
+from sfkd_jax.certificate import RecordedConditions
 from sfkd_jax.certification.corridor import (
     calibrate_on_runs,
     check_count,
@@ -27,8 +31,9 @@ def main(run: Run) -> dict[str, Any]:
     folder = run.directory
     level = run.settings.certification.level
     trained = policy.restore(folder)
-    document, reason = policy.read_certificate(folder, trained)
-    if document is None or trained.law is None or "corridor" not in document:
+    certificate, reason = policy.read_certificate(folder, trained)
+    corridor = certificate.corridor if certificate else None
+    if certificate is None or trained.law is None or corridor is None:
         reason = reason or "its certificate has no corridor"
         raise ValueError(f"{folder}: nothing to calibrate again, {reason}")
     runs, contents = recorded_runs(run.settings.collect.path, trained)
@@ -36,35 +41,40 @@ def main(run: Run) -> dict[str, Any]:
     seconds = steps * trained.vehicle.dt
     check_count(count, level, "runs")
     loop = closed_loop(trained.vehicle, trained.model, trained.params, trained.law, ())
-    scores, lateral = scores_of_runs(loop, document, runs)
-    coverage = corridor_coverage(build.corridor_of(document)["bounds"], scores)
+    scores, lateral = scores_of_runs(loop, certificate.proof.outputs, runs)
+    coverage = corridor_coverage(corridor.in_force().bounds, scores)
     store.print_message(
         f"{count} runs, cut to the shortest, {seconds:g} s: "
         f"{1e3 * np.sqrt(np.mean(lateral**2)):.1f} mm (RMS) from the path, "
-        f"{coverage['coverage']:.0%} of them inside the corridor that was known before"
+        f"{coverage.share:.0%} of them inside the corridor that was known before"
     )
+    conditions = RecordedConditions(
+        runs=count,
+        contents=contents,
+        duration_s=seconds,
+        lateral_m=float(np.max(np.abs(lateral))),
+    )
+    calibrate = partial(calibrate_on_runs, corridor.bounds, conditions=conditions)
     for number in COUNTS:
         if number > count:
             continue
         # The highest level that so many runs can promise.
         highest = number / (number + 1) - 1e-9
-        recorded = calibrate_on_runs(document, scores[:number], highest)
+        of_first = calibrate(scores[:number], highest)
         store.print_message(
-            f"after {number} runs: corridor {recorded['corridor_m']:.3f} m "
+            f"after {number} runs: corridor {of_first.corridor_m:.3f} m "
             f"at level {highest:.2f}"
         )
-    recorded = calibrate_on_runs(document, scores, level)
-    recorded["conditions"] = {
-        "runs": count,
-        "contents": contents,
-        "duration_s": seconds,
-        "lateral_m": float(np.max(np.abs(lateral))),
-    }
+    recorded = calibrate(scores, level)
     path = folder / policy.RECORDED
     if path.exists():
         store.print_message(f"{path} is replaced")
-    store.write_json(path, {**document, "recorded": recorded})
-    return {"certificate": str(path), **recorded}
+    certificates.write(
+        path,
+        replace(certificate, corridor=replace(corridor, recorded=recorded)),
+        signing_key=run.settings.certification.signing_key,
+    )
+    return {"certificate": str(path), **store.plain(asdict(recorded))}
 
 
 if __name__ == "__main__":

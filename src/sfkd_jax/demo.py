@@ -33,7 +33,7 @@ def main(run: Run) -> dict[str, Any]:
     episodes = evaluating.make_episodes(run)
     home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
     references = build.reference_systems(run.plant, trained.law)
-    certificate = trained.certificate or {}
+    corridor = trained.certificate.corridor if trained.certificate else None
     systems = {
         trained.settings["model"]["system"]: build.System(
             trained.model,
@@ -54,7 +54,7 @@ def main(run: Run) -> dict[str, Any]:
         # The last ones: those of an earlier demo with other settings come before.
         rows = run_directory.read_results(home)[-len(driven) :]
         store.print_message(text_table(rows, *PRINTED))
-        half_width = certificate.get("corridor", {}).get("corridor_m")
+        half_width = corridor.corridor_m if corridor else None
         path = home.with_name(f"{home.name}.gif")
         film = film_of(path, of_rows(home, rows), half_width)
     seconds = time.perf_counter() - began

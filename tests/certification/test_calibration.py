@@ -48,7 +48,7 @@ def test_conformal_bounds_cover_a_new_trajectory_as_often_as_they_say(level, cou
     for _ in range(250):
         reference, calibration = scores(random, 50), scores(random, count)
         bounds = conformal_bounds(reference, calibration, level=level)
-        shares.append(coverage(bounds, scores(random, 100))["coverage"])
+        shares.append(coverage(bounds, scores(random, 100)).share)
     exact = np.ceil((count + 1) * level) / (count + 1)
     assert abs(np.mean(shares) - exact) < 4 * np.std(shares) / np.sqrt(250)
     assert level - 1e-12 <= exact <= level + 1 / (count + 1)
@@ -74,7 +74,7 @@ def test_a_level_that_is_none_is_refused(level):
 
 
 def test_segments_of_few_runs_give_the_interval_of_few_trials():
-    between = [coverage_interval(0.5, 2)[0], coverage_interval(1.0, 2)[1]]
+    between = (coverage_interval(0.5, 2)[0], coverage_interval(1.0, 2)[1])
     assert coverage_interval(0.9, 2) == between
     narrow, wide = coverage_interval(0.95, 600), coverage_interval(0.95, 4)
     assert wide[0] < narrow[0] < 0.95 < narrow[1] < wide[1]
@@ -94,7 +94,7 @@ def test_runs_without_a_bound_exceed_every_bound_and_too_many_are_refused():
     few[:4, 0], largest[:4, 0] = np.inf, 1e9
     found = conformal_bounds(table, few, level=0.9)
     np.testing.assert_array_equal(found, conformal_bounds(table, largest, level=0.9))
-    assert coverage(found, few)["coverage"] <= 46 / 50
+    assert coverage(found, few).share <= 46 / 50
 
 
 def largest(data):

@@ -1,6 +1,7 @@
 """Certificates of real weights: what is proved, and what is measured."""
 
 import json
+from dataclasses import asdict
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,9 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, certified, jit, model_and_params
 
-from sfkd_jax.certification import Certificate, CertificationRefused, certify, verify
+from sfkd_jax.certificate import Proof
+from sfkd_jax.certificate._reading import read_as
+from sfkd_jax.certification import CertificationRefused, prove, verify_proof
 from sfkd_jax.certification._attack import attack_slopes
 from sfkd_jax.geometry import between
 from sfkd_jax.types import POSE
@@ -33,8 +36,9 @@ def test_alpha_is_recomputed_and_lies_below_and_close_to_what_was_requested(name
     else:
         assert 0.5 * BETA < proved.beta <= BETA
     model, params = model_and_params(name)
-    restored = Certificate.from_document(json.loads(json.dumps(proved.document())))
-    verify(restored, params, model=model)
+    restored = read_as(Proof, json.loads(json.dumps(asdict(proved))))
+    assert restored == proved
+    verify_proof(restored, model, params)
 
 
 def test_the_decoders_constants_bound_what_a_step_emits():
@@ -70,12 +74,12 @@ def test_the_decoders_constants_bound_what_a_step_emits():
 
 def test_models_without_explicit_weights_are_refused():
     with pytest.raises(CertificationRefused, match="no explicit weights"):
-        certify(*model_and_params("oracle"), BOX)
+        prove(*model_and_params("oracle"), BOX)
 
 
 def test_a_free_residual_that_does_not_contract_is_refused():
     with pytest.raises(CertificationRefused, match=r"alpha = 2\.\d+ .* is not below 1"):
-        certify(*model_and_params("no_contraction"), BOX, attack_starts=0)
+        prove(*model_and_params("no_contraction"), BOX, attack_starts=0)
 
 
 def test_a_free_residual_that_happens_to_be_small_is_certified_after_the_fact():
@@ -83,7 +87,7 @@ def test_a_free_residual_that_happens_to_be_small_is_certified_after_the_fact():
     model, params = model_and_params("no_contraction")
     network = params["networks"]["residual_weights"]
     small = network | {"kernel_2": 0.01 * network["kernel_2"]}
-    proved = certify(
+    proved = prove(
         model, with_networks(params, residual_weights=small), BOX, attack_starts=0
     )
     reached = attack_slopes([*map(np.float64, jax.tree.leaves(small))])
@@ -98,7 +102,7 @@ def test_weights_that_are_not_numbers_are_refused(leaf, value):
     spoiled = np.array(params["networks"][leaf])
     spoiled.flat[0] = value
     with pytest.raises(CertificationRefused, match="not finite"):
-        certify(model, with_networks(params, **{leaf: spoiled}), BOX)
+        prove(model, with_networks(params, **{leaf: spoiled}), BOX)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -106,9 +110,9 @@ def test_a_decoder_that_emits_a_constant_has_constant_zero():
     model, params = model_and_params("sfkd")
     network = params["networks"]["decoder_weights"]
     silent = network | {"tall_1": np.zeros_like(network["tall_1"])}
-    proved = certify(
+    proved = prove(
         model, with_networks(params, decoder_weights=silent), BOX, attack_starts=0
     )
     for output in ("position", "yaw", "decoder"):
         assert proved.lipschitz[output] == 0.0
-    verify(proved, with_networks(params, decoder_weights=silent), model=model)
+    verify_proof(proved, model, with_networks(params, decoder_weights=silent))

@@ -1,5 +1,7 @@
 """The corridor: joint bounds, and a policy end to end."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,16 @@ from helpers import TINY, any_law, path_space
 
 from sfkd_jax import data as datasets
 from sfkd_jax import models, policy, store
-from sfkd_jax.certification import CertificationRefused, issue, verify_document
+from sfkd_jax.certificate import (
+    Bounds,
+    Boxes,
+    Certificate,
+    Coverage,
+    Provenance,
+    read,
+    write,
+)
+from sfkd_jax.certification import measure, prove, verify
 from sfkd_jax.certification._measured import coverage_interval
 from sfkd_jax.certification._tubes import (
     ALONE,
@@ -15,7 +26,7 @@ from sfkd_jax.certification._tubes import (
     calibrate_corridor,
     corridor_coverage,
 )
-from sfkd_jax.certification.corridor import certify_corridor, closed_loop
+from sfkd_jax.certification.corridor import closed_loop, measure_corridor
 from sfkd_jax.plants import kinematic
 
 NAMES = (*JOINT, *ALONE)
@@ -34,21 +45,17 @@ def test_bounds_are_units_of_other_runs_times_a_quantile():
         ]
     )
     bounds = calibrate_corridor(reference, new, level=0.5)
-    assert bounds == pytest.approx(
-        dict(zip(NAMES, [2.0, 38.0, 380.0, 6.0, 0.3], strict=True))
-    )
+    expected = dict(zip(NAMES, [2.0, 38.0, 380.0, 6.0, 0.3], strict=True))
+    assert vars(bounds) == pytest.approx(expected)
 
 
 def test_a_run_on_its_bound_is_covered_and_one_that_leaves_any_bound_is_not():
-    bounds = dict(zip(NAMES, (1.0, 2.0, 3.0, 0.1, 0.1), strict=True))
+    bounds = Bounds(**dict(zip(NAMES, (1.0, 2.0, 3.0, 0.1, 0.1), strict=True)))
     inside = np.tile([1.0, 2.0, 3.0, 9.0, 9.0], (5, 1))
     inside[range(3), range(3)] *= 1 + 1e-9
-    assert corridor_coverage(bounds, inside) == {
-        "coverage": 0.4,
-        "coverage_ci95": coverage_interval(0.4, 5),
-        "coverage_trajectories": 5,
-        "coverage_runs": 5,
-    }
+    assert corridor_coverage(bounds, inside) == Coverage(
+        share=0.4, ci95=coverage_interval(0.4, 5), trajectories=5, runs=5
+    )
 
 
 # --- end to end, of an untrained policy: the claims do not depend on training ---------
@@ -69,7 +76,7 @@ DATA = BOX | {
 }
 
 
-def test_a_document_with_a_corridor_verifies():
+def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     """As `certify` makes it, with fewer and shorter runs."""
     options = TINY | {"frame": "path", "transport": False, "budget": "joint"}
     model = models.sfkd(path_space(), **options)
@@ -82,52 +89,56 @@ def test_a_document_with_a_corridor_verifies():
     validation, calibration, test = (
         jax.tree.map(lambda leaf, k=k: leaf[k::3], driven) for k in range(3)
     )
-    body = np.asarray(driven.states)[..., 3:].reshape(-1, 3)
-    boxes = {
-        "state": [body.min(0).tolist(), body.max(0).tolist()],
-        "control": [[-0.03, -1.0, -0.05, 3.0], [0.03, 1.0, 0.05, 12.0]],
-        "env": [list(side) for side in BOX.values()],
-    }
-    document = issue(
+    body = np.asarray(driven.states, np.float64)[..., 3:].reshape(-1, 3)
+    boxes = Boxes(
+        state=(tuple(body.min(0).tolist()), tuple(body.max(0).tolist())),
+        control=((-0.03, -1.0, -0.05, 3.0), (0.03, 1.0, 0.05, 12.0)),
+        env=(BOX["env_low"], BOX["env_high"]),
+    )
+    proof = prove(model, params, boxes.env, validation=validation, attack_starts=0)
+    measured = measure(
         model,
         params,
+        proof,
         validation=validation,
         calibration=calibration,
         held_out=dict.fromkeys(("test", "uniform", "s3"), test),
         boxes=boxes,
         level=0.9,
-        attack_starts=0,
     )
     small = {"runs": 24, "duration": 4.0, "attack_steps": 3000}
-    document["corridor"] = certify_corridor(
-        loop, document["outputs"], DATA, 0.9, **small
-    )
-    hashes = {"policy_sha256": "0" * 64, "weights_sha256": "1" * 64}
-    document |= hashes | {"versions": store.versions() | document["versions"]}
-    low, high = map(np.asarray, (boxes["state"]))
-    scales = {
-        **{"body_mean": (low + high) / 2, "body_scale": (high - low) / 3},
-        **{"control_mean": [0, 0, 0, 7.5], "control_scale": [0.03, 1, 0.05, 4.5]},
-    }
+    corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, **small)
     settings = {
-        "vehicle": {"dt": 0.1},
-        "space": path_space()._asdict() | scales,
+        "space": path_space()._asdict(),
         "environment": {"low": BOX["env_low"], "high": BOX["env_high"]},
-        "dataset": DATA | {"segments": 120, "shares": (0.0, 1 / 3, 1 / 3, 1 / 3)},
     }
     trained = policy.TrainedModel(
         model, params, kinematic(), any_law(), settings, "1" * 64, "0" * 64
     )
-    # Read back: only then are tuples lists, as in a file.
-    verify_document(store.plain(document), trained)
-    # The claim is that of the worst group, whatever the document says.
-    document = store.plain(document)
-    corridor = document["corridor"]
-    groups = corridor["by_group"]
+    certificate = Certificate(
+        proof=proof,
+        measured=measured,
+        corridor=corridor,
+        provenance=Provenance(
+            policy_sha256="0" * 64,
+            weights_sha256="1" * 64,
+            versions=store.versions(),
+            seconds=1.0,
+        ),
+    )
+    write(tmp_path / "certificate.json", certificate)
+    again = read(tmp_path / "certificate.json")
+    assert replace(again, sha256="") == certificate
+    verify(again, trained)
+    assert measured.outputs.keys() == {"position", "yaw"}
+    assert corridor.conditions.acceleration == 2.0
+    groups = corridor.by_group
     assert list(groups) == ["bends", "speeds", "lane_changes"]
-    for kind, bound in corridor["bounds"].items():
-        assert bound == max(group["bounds"][kind] for group in groups.values())
-    assert corridor["conditions"]["acceleration"] == 2.0
-    groups["lane_changes"]["bounds"]["nominal"] = 1e5
-    with pytest.raises(CertificationRefused, match=r"corridor\.bounds does not follow"):
-        verify_document(document, trained)
+    # The claim is that of the worst group.
+    for kind, bound in vars(corridor.bounds).items():
+        assert bound == max(getattr(of.bounds, kind) for of in groups.values())
+    assert corridor.coverage in [of.coverage for of in groups.values()]
+    assert corridor.coverage.share == min(of.coverage.share for of in groups.values())
+    assert corridor.corridor_m == pytest.approx(
+        corridor.bounds.nominal + corridor.bounds.vehicle_to_nominal_position
+    )

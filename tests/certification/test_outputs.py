@@ -2,6 +2,7 @@
 
 import inspect
 import json
+from dataclasses import asdict, replace
 from functools import cache, partial
 
 import jax
@@ -12,18 +13,18 @@ from helpers import ENV_HIGH, ENV_LOW, TINY, path_space
 from networks import NETWORK, ROOT, TURNED
 
 from sfkd_jax import models
-from sfkd_jax.certification import CertificationRefused, OutputMetric
-from sfkd_jax.certification._claims import (
-    readouts,
-)
-from sfkd_jax.certification._measured import Residuals, residuals
+from sfkd_jax.certificate import OutputMetric
+from sfkd_jax.certificate._reading import read_as
+from sfkd_jax.certification import CertificationRefused
+from sfkd_jax.certification._claims import readouts, rows
+from sfkd_jax.certification._measured import Residuals, residuals, worst_gaps
 from sfkd_jax.certification._metric_claims import (
     OUTPUTS,
     require_output_metric,
     size_of,
 )
 from sfkd_jax.certification._metrics import accepted_metric, propose_metric
-from sfkd_jax.certification._tubes import radii, worst_gaps
+from sfkd_jax.certification._tubes import radii
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Declared, Trajectory
@@ -49,9 +50,9 @@ def refuted(name, claim, message, weights=TURNED):
 @every_output
 def test_what_was_found_is_proved_also_from_json(name):
     claim = HONEST[name]
-    again = OutputMetric.from_document(json.loads(json.dumps(claim.document())))
+    again = read_as(OutputMetric, json.loads(json.dumps(asdict(claim))))
     require(name, again, TURNED)
-    assert again.document() == claim.document()
+    assert again == claim
     assert 0.5 < claim.alpha < 1.0
 
 
@@ -63,31 +64,31 @@ def test_the_constants_are_those_of_the_matrices(name):
     assert claim.lipschitz == pytest.approx(gain, rel=1e-5)
     for constant in ("alpha", "lipschitz"):
         value = getattr(claim, constant)
-        require(name, claim._replace(**{constant: 1.001 * value}), TURNED)
+        require(name, replace(claim, **{constant: 1.001 * value}), TURNED)
         for share in (0.5, 1 - 4e-6):
-            smaller = claim._replace(**{constant: share * value})
+            smaller = replace(claim, **{constant: share * value})
             refuted(name, smaller, f".{constant} does not follow")
 
 
 @pytest.mark.parametrize("constant", ["alpha", "lipschitz"])
-@pytest.mark.parametrize("value", [0.0, -5e-324, np.inf, np.nan, 1, "0.5", None, True])
+@pytest.mark.parametrize("value", [0.0, -5e-324, np.inf, np.nan])
 def test_what_is_no_bound_is_none(constant, value):
-    claim = HONEST["position"]._replace(**{constant: value})
+    claim = replace(HONEST["position"], **{constant: value})
     refuted("position", claim, f".{constant} is not a bound: {value!r}")
 
 
 @pytest.mark.parametrize("alpha", [1.0, 1.0 + 1e-12, 7.0])
 def test_a_rate_that_is_proved_and_no_contraction_is_refused(alpha):
-    claim = HONEST["position"]._replace(alpha=alpha)
+    claim = replace(HONEST["position"], alpha=alpha)
     refuted("position", claim, ".alpha does not follow")
 
 
 @pytest.mark.parametrize("size", [2, 4])
 def test_a_witness_of_another_size_is_refused(size):
     claim = HONEST["position"]
-    other = claim._replace(metric=np.eye(size))
-    refuted("position", other, ".witness is of another size")
-    other = claim._replace(joint=(2 * claim.joint)[:size])
+    other = replace(claim, metric=rows(np.eye(size)))
+    refuted("position", other, ".metric is of another size")
+    other = replace(claim, joint=(2 * claim.joint)[:size])
     refuted("position", other, ".alpha does not follow")
 
 
@@ -160,7 +161,7 @@ def test_no_pair_of_latents_contradicts_the_metric():
     steepest.
     """
     claim, (model, weights, folded) = proposed(), trained()
-    factor = np.linalg.cholesky(claim.metric)
+    factor = np.linalg.cholesky(np.asarray(claim.metric))
 
     @jax.jit
     @jax.vmap
@@ -213,7 +214,7 @@ def test_radii_of_one_dimension_are_the_sums_that_they_are():
     """z⁺ = z/2, y = 2 z, |d| = 1, 0, 1, 0: R = 1, 1/2, 5/4, 5/8 and |y − ŷ| ≤ 2·½·R
     before + ε.
     """
-    claim = OutputMetric(0.5, 2.0, np.eye(1), [[]])
+    claim = OutputMetric(alpha=0.5, lipschitz=2.0, metric=((1.0,),), joint=((),))
     steps = np.asarray([1.0, 0.0, -1.0, 0.0]).reshape(1, 4, 1)
     misses = np.asarray([0.1, 0.0, 0.0, 0.3]).reshape(1, 4, 1) * np.ones((1, 1, 3))
     bounds = radii(Residuals(steps, misses), "position", claim)

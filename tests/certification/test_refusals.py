@@ -14,7 +14,7 @@ from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
     _verification,
-    certify,
+    prove,
 )
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.types import Samples
@@ -39,7 +39,7 @@ def declaring(model, **changes):
 def test_an_activation_whose_slopes_are_not_known_is_refused(activation):
     model, params = model_and_params("sfkd")
     with pytest.raises(CertificationRefused, match="slopes of the activation"):
-        certify(declaring(model, activation=activation), params, BOX)
+        prove(declaring(model, activation=activation), params, BOX)
 
 
 def test_evidence_on_a_grid_is_refused_by_name():
@@ -48,7 +48,7 @@ def test_evidence_on_a_grid_is_refused_by_name():
     with pytest.raises(
         CertificationRefused, match="grid-only evidence: 49 sampled environments"
     ):
-        certify(declaring(model, operators=operators), params, BOX)
+        prove(declaring(model, operators=operators), params, BOX)
 
 
 def test_a_transport_that_stretches_is_found_out():
@@ -62,7 +62,7 @@ def test_a_transport_that_stretches_is_found_out():
         CertificateContradicted,
         match=r"INTERNAL ERROR: the attack on the transport reaches 1\.001",
     ):
-        certify(model._replace(transport=stretched), params, BOX, attack_starts=1)
+        prove(model._replace(transport=stretched), params, BOX, attack_starts=1)
 
 
 def at_the_limit(name):
@@ -89,7 +89,7 @@ def modulated(model):
 def test_a_step_that_is_not_what_it_declares_is_contradicted_by_the_attack():
     model, params = at_the_limit("sfkd")
     with pytest.raises(CertificateContradicted, match="the attack on the step reaches"):
-        certify(modulated(model), params, BOX, attack_starts=1)
+        prove(modulated(model), params, BOX, attack_starts=1)
 
 
 @pytest.mark.parametrize("car", ["dynamic", "kinematic"])
@@ -111,7 +111,7 @@ def test_certificates_that_ship_survive_other_roundings(car, monkeypatch):
 
 
 def test_the_attack_comes_close_to_the_certificate_and_stays_below():
-    proved = certify(*at_the_limit("sfkd"), BOX, attack_starts=4)
+    proved = prove(*at_the_limit("sfkd"), BOX, attack_starts=4)
     assert 1.0 <= proved.tightness <= 1.04
     assert proved.attacks["residual_slopes"] > proved.beta / 1.15
     # An isometry, as served.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers import certified, driven, jit, model_and_params
 
+from sfkd_jax.certificate import StepErrors
 from sfkd_jax.certification import latent_tube
 from sfkd_jax.certification._measured import RESIDUALS, residuals
 from sfkd_jax.certification._tubes import tubes
@@ -26,19 +27,19 @@ def test_the_physical_tube_is_its_finite_sums():
     given = {
         "alpha": 0.5,
         "lipschitz": {"position": 2.0, "yaw": 0.5, "body": 3.0},
-        "one_step": {"latent": 2.0, "position": 0.1, "yaw": 0.01, "body": 0.2},
+        "one_step": StepErrors(latent=2.0, position=0.1, yaw=0.01, body=0.2),
         "horizon": 3,
     }
-    tube = tubes(**given, largest_increment=10.0)["physical"]
+    tube = tubes(**given, largest_increment=10.0).physical
     yaw = [0.01, 0.02 + 1.0, 0.03 + 2.5]
     np.testing.assert_allclose(tube["yaw_rad"], yaw)
     position = [0.1, 0.2 + 4.0 + 10 * yaw[0], 0.3 + 10.0 + 10 * (yaw[0] + yaw[1])]
     np.testing.assert_allclose(tube["position_m"], position)
     np.testing.assert_allclose(tube["body"], [0.2, 0.2 + 3.0, 0.2 + 4.5])
     along = tubes(**given, largest_increment=None)
-    np.testing.assert_allclose(along["physical"]["position_m"], [0.1, 2.1, 3.1])
-    assert along["ultimate"] == 4.0
-    assert along["asymptotic"] == pytest.approx(
+    np.testing.assert_allclose(along.physical["position_m"], [0.1, 2.1, 3.1])
+    assert along.ultimate == 4.0
+    assert along.asymptotic == pytest.approx(
         {"position_m": 4.1, "yaw_rad": 1.01, "body": 6.2}
     )
 
@@ -64,9 +65,11 @@ def test_free_running_predictions_stay_inside_the_physical_tube():
         tube = tubes(
             alpha=proved.alpha,
             lipschitz=proved.lipschitz,
-            one_step={kind: float(measured[kind][k]) for kind in RESIDUALS},
+            one_step=StepErrors(
+                **{kind: float(measured[kind][k]) for kind in RESIDUALS}
+            ),
             horizon=12,
             largest_increment=float(moves[k].max()),
-        )["physical"]
+        ).physical
         for radii, error in zip(tube.values(), (position, yaw, body), strict=True):
             assert np.all(error[k] <= np.asarray(radii) + 2e-5)

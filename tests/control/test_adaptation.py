@@ -159,11 +159,11 @@ def test_the_certificate_of_the_model_holds_for_the_adapted_one():
     push = jnp.zeros(4), jnp.full(4, 1e3)
     offset = Offset(params, jnp.full(2, 50.0), push)
     adapted = exported(with_offset(model), offset)
-    certification.verify(certificate, offset.params, model=model, weights=adapted)
+    certification.verify_proof(certificate, model, offset.params, weights=adapted)
     larger = jax.tree.map(lambda leaf: 3.0 * leaf, params)
     broken = exported(with_offset(model), offset._replace(params=larger))
     with pytest.raises(certification.CertificationRefused):
-        certification.verify(certificate, params, model=model, weights=broken)
+        certification.verify_proof(certificate, model, params, weights=broken)
 
 
 def test_a_constant_side_force_is_found():

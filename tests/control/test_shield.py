@@ -1,5 +1,6 @@
 """The safety filter: what passes, what it guarantees, and what it reports."""
 
+from dataclasses import replace
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -11,10 +12,18 @@ from helpers import any_law, jit, tiny
 
 import sfkd_jax
 from sfkd_jax import build, control, scenarios
+from sfkd_jax.certificate import (
+    Boxes,
+    JointBounds,
+    Recorded,
+    RecordedConditions,
+    read,
+)
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.plants import kinematic
+from sfkd_jax.policy import SHIPPED
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
 
@@ -422,37 +431,55 @@ def test_invalid_settings_are_refused_in_one_line(changes, line):
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     """A data set on one side of the path must not put the other side outside."""
-    corridor = {
-        "bounds": {"nominal": 0.08, "vehicle_to_nominal_position": 0.06},
-        "corridor_m": 0.14,
-        "shield_horizon": 20,
-        "conditions": {"sensor_noise": [0.01, 0.01, 0.002]},
-    }
-    boxes = {
-        "state": [[-0.05, -0.1, 7.0], [0.4, 0.1, 11.0]],
-        "env": [[0.3, -8.0], [0.9, 8.0]],
-        "control": [[-0.03, -1.0, -0.02, 8.0], [0.03, 1.0, 0.02, 10.0]],
-    }
+    certificate = read(SHIPPED / "kinematic_path" / "certificate.json")
+    bounds = replace(
+        certificate.corridor.bounds, nominal=0.08, vehicle_to_nominal_position=0.06
+    )
+    corridor = replace(
+        certificate.corridor,
+        bounds=bounds,
+        corridor_m=0.14,
+        conditions=replace(
+            certificate.corridor.conditions, sensor_noise=(0.01, 0.01, 0.002)
+        ),
+    )
+    boxes = Boxes(
+        state=((-0.05, -0.1, 7.0), (0.4, 0.1, 11.0)),
+        env=((0.3, -8.0), (0.9, 8.0)),
+        control=((-0.03, -1.0, -0.02, 8.0), (0.03, 1.0, 0.02, 10.0)),
+    )
+    measured = replace(certificate.measured, boxes=boxes)
     made, shield = {}, control.Shield
     record = lambda **options: made.update(options) or shield(**options)
     monkeypatch.setattr(control, "Shield", record)
-    certificate = {"corridor": corridor, "boxes": boxes, "alpha": 0.9}
-    build_with = partial(build.in_corridor, scripted(), TOY, kinematic(), LAW)
-    build_with(certificate)
+    in_corridor = partial(build.in_corridor, scripted(), TOY, kinematic(), LAW)
+
+    def build_with(corridor):
+        in_corridor(replace(certificate, measured=measured, corridor=corridor))
+
+    build_with(corridor)
     low, high = made["conditions"].state
     # Other coordinates have the box of the data and a quarter of its width.
     assert low == pytest.approx((-0.17, -0.15, 6.0))
     assert high == pytest.approx((0.4, 0.15, 12.0))
-    assert boxes["state"][0][0] == -0.05
     expected = (0.08, 0.06, pytest.approx(0.03))
     assert (made["width"], made["tube"], made["noise_allowance"]) == expected
     # Measured on a model of logs, it claims nothing of the car before its own runs do.
-    corridor["conditions"]["identified_from"] = "contents"
-    build_with(certificate)
+    identified = replace(corridor.conditions, identified_from="contents")
+    corridor = replace(corridor, conditions=identified)
+    build_with(corridor)
     assert not made["claimed"]
-    bounds = {"nominal": 0.08, "vehicle_to_nominal_position": 0.1}
-    recorded = {"bounds": bounds, "corridor_m": 0.18, "level": 0.8, "conditions": {}}
-    build_with(certificate | {"recorded": recorded})
+    recorded = Recorded(
+        bounds=JointBounds(
+            nominal=0.08, vehicle_to_nominal_position=0.1, vehicle_to_nominal_yaw=0.1
+        ),
+        corridor_m=0.18,
+        level=0.8,
+        conditions=RecordedConditions(
+            runs=9, contents="", duration_s=60.0, lateral_m=0.1
+        ),
+    )
+    build_with(replace(corridor, recorded=recorded))
     assert (made["claimed"], made["tube"]) == (True, 0.1)
 
 

@@ -51,10 +51,14 @@ def test_the_certificate_is_about_the_weights(smoke):
     certificate = json.loads((directory / document["certificate"]).read_text())
     file = directory / document["run"] / "policy.safetensors"
     assert certificate["valid"]
-    assert certificate["weights_sha256"] == read_policy(file)[1]["sha256"]
-    assert len(certificate["tube"]["latent"]) == 20
-    assert set(certificate["d_bar"]["by_scenario"]) == {"uniform", "wet", "s3"}
-    assert 1.0 <= certificate["tightness"] <= 1.1
+    assert certificate["provenance"]["weights_sha256"] == read_policy(file)[1]["sha256"]
+    assert len(certificate["measured"]["tube"]["latent"]) == 20
+    assert set(certificate["measured"]["d_bar"]["by_scenario"]) == {
+        "uniform",
+        "wet",
+        "s3",
+    }
+    assert 1.0 <= certificate["proof"]["tightness"] <= 1.1
 
 
 def test_certify_exits_3_when_weights_changed_and_0_when_renewed(copied):

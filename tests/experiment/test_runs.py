@@ -57,7 +57,7 @@ def certified(monkeypatch, tmp_path):
         certification = first.settings.certification
         document = {
             "valid": True,
-            "certification": stages._recorded_certification(certification),
+            "provenance": {"settings": stages._recorded_certification(certification)},
         }
         write_json(first.certificate_path, document)
         made.clear()
@@ -69,6 +69,8 @@ def certified(monkeypatch, tmp_path):
 
 def test_a_certificate_with_the_same_settings_is_kept(certified):
     assert certified(()) == certified((), "certification.renew=true") == 0
+    # Who signs it changes nothing of what is claimed.
+    assert certified((), "certification.signing_key=key.pem") == 0
 
 
 @pytest.mark.parametrize("change", ["level=0.8", "corridor.runs=99"])

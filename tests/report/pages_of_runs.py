@@ -64,17 +64,24 @@ def arrays(size=0.05, episodes=2):
     return {name: np.stack([part] * episodes) for name, part in parts.items()}
 
 
-def certificate(**more):
+BOXES = {"env": [[0.3, -8.0], [0.9, 8.0]], "control": None}
+
+
+def certificate(*, alpha=0.93207, weights=WEIGHTS_SHA256, boxes=BOXES, **more):
     radii = [0.0123 * (1 - 0.93207**k) / (1 - 0.93207) for k in range(1, 21)]
     corridor = {
-        "corridor_m": 0.14301, "level": 0.95, "coverage": 0.99, "coverage_ci95": [0.96, 1.0],
+        "corridor_m": 0.14301, "level": 0.95,
+        "coverage": {"share": 0.99, "ci95": [0.96, 1.0]},
         "runs": 150, "conditions": {"speed": [8.0, 10.5], "duration_s": 60.0},
     }  # fmt: skip
-    return {
-        "valid": True, "reason": None, "alpha": 0.93207, "weights_sha256": WEIGHTS_SHA256,
+    measured = {
         "tube": {"latent": radii, "physical": {"position_m": radii}, "ultimate": 0.18115},
-        "d_bar": {"value": 0.0123, "level": 0.95, "trajectories": 400}, "corridor": corridor,
-        "boxes": {"env": [[0.3, -8.0], [0.9, 8.0]], "control": None},
+        "d_bar": {"one_step": {"latent": 0.0123}, "level": 0.95, "trajectories": 400},
+        "boxes": boxes,
+    }  # fmt: skip
+    return {
+        "valid": True, "proof": {"alpha": alpha}, "measured": measured, "corridor": corridor,
+        "provenance": {"weights_sha256": weights},
     } | more  # fmt: skip
 
 

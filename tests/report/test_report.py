@@ -164,7 +164,7 @@ def test_the_certificate_is_in_words_and_numbers_that_never_round_down(run_page)
     [
         ({"valid": False, "reason": "ρ is 1.2"}, "ρ is 1.2"),
         ({"alpha": 1.0}, "no reason"),
-        ({"weights_sha256": "cd" * 32}, "other weights"),
+        ({"weights": "cd" * 32}, "other weights"),
     ],
 )
 def test_what_is_not_certified_is_said(tmp_path, no_figures, change, reason):
@@ -176,6 +176,17 @@ def test_what_is_not_certified_is_said(tmp_path, no_figures, change, reason):
     assert "No contraction is certified" in text
     assert reason in text
     assert "0.1431" not in text
+
+
+def test_the_page_believes_no_signature_that_it_has_not_checked(tmp_path, no_figures):
+    signature = {"public_key": "ab" * 32, "value": "00"}
+    run = made.write_run(
+        tmp_path, episodes=False, certificate=made.certificate(signature=signature)
+    )
+    write_report(run)
+    text = words(run / "report")
+    assert f"measured, signed by {'ab' * 32} |" not in text
+    assert "which is not checked" in text or "measured, unsigned: the signature" in text
 
 
 def test_a_page_of_a_new_run_names_the_commands_that_come_next(tmp_path, no_figures):

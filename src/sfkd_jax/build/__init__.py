@@ -6,7 +6,6 @@ Every function takes an object of settings, or plain values that are parsed into
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 from functools import partial
 from typing import Annotated, Any, NamedTuple
 
@@ -27,7 +26,6 @@ from sfkd_jax.build._controllers import build_controller as build_controller
 from sfkd_jax.build._controllers import build_in_lane as build_in_lane
 from sfkd_jax.build._corridor import corridor_of as corridor_of
 from sfkd_jax.build._corridor import in_corridor as in_corridor
-from sfkd_jax.build._corridor import is_claimed as is_claimed
 from sfkd_jax.build._vehicles import IDENTIFIED as IDENTIFIED
 from sfkd_jax.build._vehicles import LOGGED as LOGGED
 from sfkd_jax.build._vehicles import PLANTS as PLANTS
@@ -37,6 +35,7 @@ from sfkd_jax.build._vehicles import VehicleSettings as VehicleSettings
 from sfkd_jax.build._vehicles import build_driver as build_driver
 from sfkd_jax.build._vehicles import build_vehicle as build_vehicle
 from sfkd_jax.build._vehicles import takes_logs as takes_logs
+from sfkd_jax.certificate import Certificate
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -176,7 +175,7 @@ class System(NamedTuple):
     model: Model
     params: Any
     env_source: str
-    certificate: Mapping[str, Any] | None = None
+    certificate: Certificate | None = None
     law: control.PathLaw | None = None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from sfkd_jax.build._controller_settings import (
     SearchSettings,
 )
 from sfkd_jax.build._corridor import Corner, conditions_of, corridor_of, in_corridor
+from sfkd_jax.certificate import Certificate
 from sfkd_jax.geometry import CURVATURE, HEADING, PATH_SPEED, REFERENCE_SPEED
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
@@ -48,7 +48,7 @@ def build_controller(
     *,
     env_low: Corner = None,
     env_high: Corner = None,
-    certificate: Mapping[str, Any] | None = None,
+    certificate: Certificate | None = None,
     env_source: str = "measured",
     law: control.PathLaw | None = None,
     adaptive: bool = False,
@@ -111,7 +111,7 @@ def build_controller(
         inner = _planner_along_path(settings, loop, adaptive=adaptive)
     # A shield needs a certified corridor; without one the planner drives alone.
     shielded = planner is not None or settings.shield
-    if shielded and certificate is not None and certificate.get("corridor"):
+    if shielded and certificate is not None and certificate.corridor is not None:
         # It predicts with the certified model, not with that of the planner.
         certified = with_offset(model) if adaptive else model
         inner = in_corridor(inner, certified, plant, law, certificate)
@@ -280,14 +280,16 @@ def _along_reference(
     inner: Controller,
     settings: SearchSettings,
     loop: _Loop,
-    certificate: Mapping[str, Any] | None,
+    certificate: Certificate | None,
 ) -> Controller:
     """Return a controller along a path behind its gate, as one of references."""
-    # A certificate without this entry was made before there was a test.
-    innovations = ((certificate or {}).get("corridor") or {}).get("innovations")
+    corridor = certificate.corridor if certificate else None
     test = None
-    if innovations and not loop.estimates_env:
-        test = control.innovation_test(innovations)
+    if corridor is not None and not loop.estimates_env:
+        calibrated = corridor.innovations
+        test = control.innovation_test(
+            calibrated.levels, calibrated.deviation, calibrated.threshold
+        )
     gate = control.Gate(
         inner=inner,
         model=loop.model,
@@ -308,7 +310,7 @@ def build_in_lane(
     inner: Controller,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Mapping[str, Any],
+    certificate: Certificate,
     *,
     horizon: int,
     car: tuple[float, float],
@@ -338,35 +340,35 @@ def build_in_lane(
         horizon=horizon,
         lead=0.0 if plant.speed_loop else 1.0 / speed_gain,
         friction=friction,
-        lowest=certificate["boxes"]["env"][0][friction or 0],
+        lowest=certificate.measured.boxes.env[0][friction or 0],
     )
 
 
 def _admissible_references(
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Mapping[str, Any],
+    certificate: Certificate,
     car: tuple[float, float],
 ) -> control.Class:
     """Return the class of references of which a corridor was certified."""
     corridor = corridor_of(certificate)
-    conditions = corridor["conditions"]
-    road_low, road_high = certificate["boxes"]["control"]
+    conditions = corridor.conditions
+    road_low, road_high = certificate.measured.boxes.control
     state_box = conditions_of(certificate).state
     heading = 0.0
     if state_box is not None:
         heading = max(abs(end[HEADING]) for end in state_box)
     return control.Class(
-        curvature=min(conditions["peak_curvature"], road_high[CURVATURE]),
-        turning=conditions["curvature_slope"],
-        lateral=min(conditions["lateral_acceleration"], float(law.high[0])),
-        jerk=conditions["lateral_jerk"],
+        curvature=min(conditions.peak_curvature, road_high[CURVATURE]),
+        turning=conditions.curvature_slope,
+        lateral=min(conditions.lateral_acceleration, float(law.high[0])),
+        jerk=conditions.lateral_jerk,
         speed=(road_low[REFERENCE_SPEED], road_high[REFERENCE_SPEED]),
         half=(0.5 * car[0], 0.5 * car[1]),
-        corridor=corridor["corridor_m"],
+        corridor=corridor.corridor_m,
         heading=heading,
-        change=conditions["acceleration"],
+        change=conditions.acceleration,
         # The rest is left for what the speed lags behind.
-        deceleration=0.75 * conditions["acceleration"],
+        deceleration=0.75 * conditions.acceleration,
         braking=6.0 if plant.speed_loop else -plant.control_low[1],
     )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from sfkd_jax import control, plants
+from sfkd_jax.certificate import Certificate, Corridor
 from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.types import Controller, Model
 
@@ -25,21 +26,15 @@ Corner = Sequence[float] | None
 """Lower or upper ends of the environment box E, if they are known."""
 
 
-def corridor_of(certificate: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the corridor of a certificate.
+def corridor_of(certificate: Certificate) -> Corridor:
+    """Return the corridor of a certificate, with the bounds that are in force.
 
-    Its bounds are those of recorded runs, if the certificate has any.
+    Raises:
+        ValueError: it has none.
     """
-    recorded = certificate.get("recorded", {})
-    measured = ("bounds", "corridor_m", "level")
-    from_runs = {name: recorded[name] for name in measured if name in recorded}
-    return {**certificate["corridor"], **from_runs}
-
-
-def is_claimed(certificate: Mapping[str, Any]) -> bool:
-    """Return whether a corridor was measured on the vehicle, not on a model of logs."""
-    identified = "identified_from" in certificate["corridor"]["conditions"]
-    return not identified or "recorded" in certificate
+    if certificate.corridor is None:
+        raise ValueError("the certificate has no corridor")
+    return certificate.corridor.in_force()
 
 
 def in_corridor(
@@ -47,7 +42,7 @@ def in_corridor(
     model: Model,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Mapping[str, Any],
+    certificate: Certificate,
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
@@ -59,7 +54,7 @@ def in_corridor(
         certificate: with a corridor.
     """
     corridor = corridor_of(certificate)
-    bounds = corridor["bounds"]
+    bounds = corridor.bounds
     lateral_noise, heading_noise = _sensor_noise(corridor)
     # What the heading's noise moves the car sideways until the law has turned it back.
     steering = np.asarray(law.gain)[..., 0, :]
@@ -68,17 +63,17 @@ def in_corridor(
         inner=planner,
         model=model,
         law=law,
-        width=bounds["nominal"],
-        tube=bounds["vehicle_to_nominal_position"],
-        horizon=corridor["shield_horizon"],
+        width=bounds.nominal,
+        tube=bounds.vehicle_to_nominal_position,
+        horizon=corridor.shield_horizon,
         noise_allowance=ALLOWANCE * lateral_noise,
         start_error=ALLOWANCE * (lateral_noise + ratio * heading_noise),
-        decay=certificate["alpha"],
+        decay=certificate.proof.alpha,
         control=(plant.control_low, plant.control_high),
         conditions=conditions_of(certificate),
         dt=plant.dt,
         rear=_slip_of_gentle_turns(law),
-        claimed=is_claimed(certificate),
+        claimed=corridor.is_claimed,
     ).controller()
 
 
@@ -98,15 +93,15 @@ def _slip_of_gentle_turns(law: control.PathLaw) -> float:
     return max(float(np.median(heading[-1] - heading[0]) / curvatures), 0.0)
 
 
-def _sensor_noise(corridor: Mapping[str, Any]) -> tuple[float, float]:
+def _sensor_noise(corridor: Corridor) -> tuple[float, float]:
     """Return the standard deviations of the measured e_y [m] and e_ψ [rad]."""
-    noise = (*corridor["conditions"]["sensor_noise"], 0.0, 0.0, 0.0)
+    noise = (*corridor.conditions.sensor_noise, 0.0, 0.0, 0.0)
     # The larger entry of a position: which one is lateral depends on the road.
     return max(noise[:2]), noise[2]
 
 
 def conditions_of(
-    certificate: Mapping[str, Any] | None,
+    certificate: Certificate | None,
     *,
     env_low: Corner = None,
     env_high: Corner = None,
@@ -122,29 +117,29 @@ def conditions_of(
     return control.Conditions(env=_box(env_low, env_high))
 
 
-def _certified_conditions(certificate: Mapping[str, Any]) -> control.Conditions:
+def _certified_conditions(certificate: Certificate) -> control.Conditions:
     """Return the boxes of a certificate, somewhat enlarged.
 
     The box of e_y contains the corridor, since the claim holds there, whether or not
     the data reach that far. The other boxes are those of the data, somewhat enlarged:
     the runs on which a corridor is calibrated leave them as well.
     """
-    boxes = certificate["boxes"]
-    low, high = (np.asarray(side, float) for side in boxes["state"])
+    boxes = certificate.measured.boxes
+    low, high = (np.asarray(side, float) for side in boxes.state)
     margin = STATE_MARGIN * (high - low)
     margin[LATERAL] = 0.0
     low = low - margin
     high = high + margin
     edge = 0.0
-    if certificate.get("corridor"):
+    if certificate.corridor is not None:
         corridor = corridor_of(certificate)
         lateral_noise, _ = _sensor_noise(corridor)
-        edge = corridor["corridor_m"] + ALLOWANCE * lateral_noise
+        edge = corridor.corridor_m + ALLOWANCE * lateral_noise
     low[LATERAL] = min(low[LATERAL], -edge)
     high[LATERAL] = max(high[LATERAL], edge)
     # [2:] are κ and v_ref; ν has its limits in the law.
-    road_low, road_high = np.asarray(boxes["control"], float)[:, 2:]
-    env_low, env_high = boxes["env"]
+    road_low, road_high = np.asarray(boxes.control, float)[:, 2:]
+    env_low, env_high = boxes.env
     return control.Conditions(
         env=_box(env_low, env_high),
         state=_box(low, high),

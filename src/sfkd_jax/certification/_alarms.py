@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sfkd_jax.certificate import Innovations
+from sfkd_jax.certification._claims import rows
 from sfkd_jax.certification._measured import alarm_thresholds
 from sfkd_jax.control import InnovationTest, PathLaw, expected_coordinates, turning_rate
 from sfkd_jax.data import sensor_keys
@@ -238,8 +240,8 @@ def calibrate_innovations(
     key: Key,
     *,
     duration: float,
-) -> dict[str, Any]:
-    """Return the entry of the certificate about the test of innovations.
+) -> Innovations:
+    """Return the calibration of the test of innovations.
 
     The thresholds are for one false alarm a day. Alarms are counted on runs that the
     calibration has not seen, and on S3.
@@ -264,15 +266,15 @@ def calibrate_innovations(
     thresholds = MARGIN * alarm_thresholds(reference, scores, rate=rate)
     test_maxima = largest(observe(test_key))
     s3_maxima = largest(observe_s3(s3_key))
-    return {
-        "levels": levels.tolist(),
-        "deviation": deviations.tolist(),
-        "threshold": thresholds.reshape(-1, deviations.shape[1]).tolist(),
-        "calibration_runs": len(maxima),
-        "runs": len(test_maxima),
-        "alarms": int(np.sum(np.any(test_maxima > thresholds, axis=1))),
-        "alarms_s3": int(np.sum(np.any(s3_maxima > thresholds, axis=1))),
-    }
+    return Innovations(
+        levels=rows(levels),
+        deviation=rows(deviations),
+        threshold=rows(thresholds.reshape(-1, deviations.shape[1])),
+        calibration_runs=len(maxima),
+        runs=len(test_maxima),
+        alarms=int(np.sum(np.any(test_maxima > thresholds, axis=1))),
+        alarms_s3=int(np.sum(np.any(s3_maxima > thresholds, axis=1))),
+    )
 
 
 def _deviations_by_level(

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from sfkd_jax.certificate import Box, Claims
 from sfkd_jax.certification._claims import (
     FLOAT32,
-    Box,
-    Claims,
     attack_limits,
     decoders,
 )

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
-import jax
 import numpy as np
 
+from sfkd_jax.certificate import Box, Claims, Multipliers
 from sfkd_jax.certification._core import (
     Matrix,
     Vector,
@@ -26,35 +25,6 @@ FLOAT32 = 1e-5
 """Relative excess over a bound that float32 rounding of an attacked model explains."""
 CONSTANTS = ("alpha", "alpha_separate", "alpha_joint", "rho", "beta")
 """Constants of a step in the 2-norm, see `Claims`."""
-Box: TypeAlias = Sequence[Any]
-"""Lower and upper corner of a box of environments."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Claims:
-    """Constants proved in the 2-norm, with their witnesses.
-
-    Attributes:
-        scope: the environments, and how all of them are covered.
-        alpha: contraction factor of a step, |F(z) − F(z')| ≤ α |z − z'| for all z, z',
-            u and all e of the scope. It is the smaller of the next two.
-        alpha_separate: ρ + β.
-        alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
-        rho: ρ = sup_e ||A(e)||.
-        beta: β, the Lipschitz constant of the residual r in z.
-        lipschitz: Lipschitz constants of the outputs "position" [m], "yaw" [rad], both
-            together ("decoder", with a decoder of the pose) and "body".
-        witnesses: multipliers of all proofs. With them a check needs no search.
-    """
-
-    scope: str
-    alpha: float
-    alpha_separate: float
-    alpha_joint: float
-    rho: float
-    beta: float
-    lipschitz: dict[str, float]
-    witnesses: dict[str, Any]
 
 
 def with_room(weights: Exported, room: float = 1.0001) -> Exported:
@@ -68,13 +38,12 @@ def with_room(weights: Exported, room: float = 1.0001) -> Exported:
     return weights._replace(residual=residual, decoder=decoder)
 
 
-def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
+def require_claims(claims: Claims, weights: Exported) -> None:
     """Refuse the first claim in the 2-norm that does not follow from its witness.
 
     Args:
         claims: from an untrusted source.
         weights: that they are about.
-        box: of the environments.
 
     Raises:
         CertificationRefused: a claim does not follow.
@@ -89,11 +58,14 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         set(actual) == {*expected},
         f"lipschitz must be of {', '.join(expected)}, got {actual}",
     )
-    require_box("env_box", box)
-    witness = claims.witnesses
+    witnesses = claims.witnesses
+    require(
+        set(witnesses.decoders) == {*networks},
+        f"witnesses must be of the decoders {', '.join(networks) or 'none'}",
+    )
     vertices = list(weights.operators.vertices)
-    residual_multipliers = vectors(witness["residual"])
-    joint_multipliers = [vectors(of_vertex) for of_vertex in witness["joint"]]
+    residual_multipliers = vectors(witnesses.residual)
+    joint_multipliers = [vectors(of_vertex) for of_vertex in witnesses.joint]
     # An operator alone has no hidden layers, and needs no multipliers.
     no_multipliers = [()] * len(vertices)
     checks = {
@@ -113,7 +85,8 @@ def require_claims(claims: Claims, weights: Exported, box: Box) -> None:
         # A read-out of zeros has the constant 0, which no strict inequality proves.
         checks[name] = not np.any(rows) or check_witness((), (), bound, rows)
     for name, network in networks.items():
-        checks[name] = _bounded(network, vectors(witness[name]), claims.lipschitz[name])
+        multipliers = vectors(witnesses.decoders[name])
+        checks[name] = _bounded(network, multipliers, claims.lipschitz[name])
     require_all(checks)
 
 
@@ -126,8 +99,8 @@ def _require_bounds(claims: Claims) -> None:
         require(is_bound, f"{name} is not a bound: {value!r}")
 
 
-def require_box(name: str, box: Box) -> np.ndarray:
-    """Return the corners of a box.
+def require_box(name: str, box: Any) -> Box:
+    """Return a box as two rows of numbers.
 
     Equal corners are allowed, since a condition may be constant. An infinite box is
     not: it would promise what no attack has looked at.
@@ -146,7 +119,8 @@ def require_box(name: str, box: Box) -> np.ndarray:
         is_finite and np.all(corners[0] <= corners[1]),
         f"{name} must be a lower and an upper corner, got {box!r}",
     )
-    return corners
+    low, high = rows(corners)
+    return low, high
 
 
 def _bounded(
@@ -206,11 +180,15 @@ def attack_limits(claims: Claims, weights: Exported) -> dict[str, float]:
     return limits
 
 
-def vectors(witness: Any) -> list[Vector]:
-    """Read the multipliers of one network from JSON values."""
-    return [np.asarray(part, dtype=np.float64) for part in witness]
+def vectors(multipliers: Multipliers) -> list[Vector]:
+    """Return the multipliers of a network as arrays."""
+    return [np.asarray(part, dtype=np.float64) for part in multipliers]
 
 
-def listed(witness: Any) -> Any:
-    """Return arrays in nested lists as JSON values."""
-    return jax.tree.map(lambda part: np.asarray(part, np.float64).tolist(), witness)
+def rows(arrays: Any) -> Any:
+    """Return arrays in nested sequences as nested tuples of numbers."""
+    if isinstance(arrays, np.ndarray):
+        arrays = arrays.tolist()
+    if isinstance(arrays, int | float):
+        return float(arrays)
+    return tuple(rows(part) for part in arrays)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.special import betaincinv
 
+from sfkd_jax.certificate import Coverage
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
@@ -22,6 +23,8 @@ ROUNDING = 1e-9
 """Far above the rounding error of a share times a count."""
 BATCH = 50
 """Number of runs in a batch."""
+WORST = 5
+"""Number of steps of every validation run that a metric is optimised for."""
 TAIL = 0.1
 """Share of the runs, those with the largest values, that the tail is fitted to."""
 
@@ -95,6 +98,16 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
         return predictions.defects, jnp.stack(norms, 1)
 
     return jax.vmap(errors_of_run)(runs)
+
+
+def worst_gaps(measured: Residuals) -> Float[np.ndarray, "run worst rank"]:
+    """Return d of the `WORST` steps of every run with the largest |d|.
+
+    These steps decide the radius of a tube, and so few keep the search fast.
+    """
+    sizes = np.linalg.norm(measured.gaps, axis=-1)
+    worst = np.argsort(sizes, axis=1)[:, -WORST:]
+    return np.take_along_axis(measured.gaps, worst[..., None], axis=1)
 
 
 def conformal_quantile(scores: Float[np.ndarray, " trajectory"], level: float) -> float:
@@ -224,7 +237,7 @@ def coverage(
     bounds: Float[np.ndarray, " error"],
     held_out: Float[np.ndarray, "trajectory error"],
     runs: int | None = None,
-) -> dict[str, Any]:
+) -> Coverage:
     """Return the share of held-out trajectories within all bounds, and its interval.
 
     Args:
@@ -233,19 +246,28 @@ def coverage(
         runs: number of independent runs that the trajectories were cut from; None if
             every trajectory is a run.
     """
-    share = float(np.mean(np.all(held_out <= bounds, axis=1)))
-    if not runs:
-        runs = len(held_out)
-    return {
-        "coverage": share,
+    within = np.all(held_out <= bounds, axis=1)
+    return coverage_of(within, runs or len(held_out))
+
+
+def coverage_of(within: Bool[np.ndarray, " trajectory"], runs: int) -> Coverage:
+    """Return the coverage of trajectories.
+
+    Args:
+        within: whether all bounds held on a trajectory.
+        runs: number of independent runs that the trajectories were cut from.
+    """
+    share = float(np.mean(within))
+    return Coverage(
+        share=share,
         # Segments of the same run are dependent, so that the interval counts runs.
-        "coverage_ci95": coverage_interval(share, runs),
-        "coverage_trajectories": len(held_out),
-        "coverage_runs": runs,
-    }
+        ci95=coverage_interval(share, runs),
+        trajectories=len(within),
+        runs=runs,
+    )
 
 
-def coverage_interval(share: float, runs: int) -> list[float]:
+def coverage_interval(share: float, runs: int) -> tuple[float, float]:
     """Return the exact 95 % interval of a coverage (Clopper and Pearson, 1934).
 
     If the share lies between two counts of runs, the interval contains those of both.
@@ -255,4 +277,4 @@ def coverage_interval(share: float, runs: int) -> list[float]:
     # At the counts 0 and `runs` the ends are exact, and betaincinv is undefined.
     low = betaincinv(fewer, runs - fewer + 1, 0.025) if fewer else 0.0
     high = betaincinv(more + 1, runs - more, 0.975) if more < runs else 1.0
-    return [float(low), float(high)]
+    return float(low), float(high)

@@ -7,6 +7,7 @@ search proves nothing: the trusted core decides what is accepted.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -19,14 +20,11 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from sfkd_jax.certification._claims import (
-    COMPILATION_SLACK,
-)
+from sfkd_jax.certificate import LyapunovClaim, OutputMetric
+from sfkd_jax.certification._claims import COMPILATION_SLACK, rows
 from sfkd_jax.certification._core import Matrix, Vector, check_metric
 from sfkd_jax.certification._metric_claims import (
     ROTATES,
-    LyapunovClaim,
-    OutputMetric,
     contracts,
     keeps_metrics,
     reads_within,
@@ -150,12 +148,15 @@ def _accepted_lyapunov(metric: Matrix, weights: Exported) -> LyapunovClaim | Non
     alpha, joint = joint_bound(step, weights.residual_multipliers)
     # Rounding decides how little slack the core accepts. The smallest is kept.
     for slack in SLACKS:
+        bound = float(values[-1] / values[0] * (1 + slack))
         claim = LyapunovClaim(
             rho=float(COMPILATION_SLACK * rate * (1 + slack)),
-            condition=float(values[-1] / values[0] * (1 + slack)),
+            condition=bound,
             alpha=float(alpha * (1 + slack)),
-            metric=metric,
-            joint=joint,
+            c_1=math.sqrt(bound),
+            c_2=math.sqrt(bound),
+            metric=rows(metric),
+            joint=rows(joint),
         )
         holds = check_metric(metric, list(vertices), claim.rho, claim.condition)
         if claim.rho < 1.0 and holds and contracts(claim, weights):
@@ -179,7 +180,7 @@ def _in_coordinates(weights: Exported, metric: Matrix) -> Exported:
 @one_thread()
 def propose_metric(
     weights: Exported,
-    rows: Matrix,
+    readout: Matrix,
     gaps: Float[np.ndarray, "run worst rank"],
     start: Matrix | None = None,
 ) -> OutputMetric:
@@ -191,7 +192,7 @@ def propose_metric(
 
     Args:
         weights: of the model.
-        rows: C of the output.
+        readout: C of the output.
         gaps: d of the worst steps of every run, of a split other than the calibration.
         start: a Lyapunov matrix of the operators. The search starts there or at I,
             whichever is better.
@@ -214,7 +215,7 @@ def propose_metric(
 
     def objective(flat: Vector, sharpness: float) -> tuple[float, Vector]:
         loss, gradient = _log_radius(
-            flat, sharpness, vertices, weights.residual, rows.T, gaps
+            flat, sharpness, vertices, weights.residual, readout.T, gaps
         )
         # A Cholesky factor of NaN says that nothing is proved at this point.
         if not (np.isfinite(loss) and np.all(np.isfinite(gradient))):
@@ -246,17 +247,17 @@ def propose_metric(
         np.split(scale * np.exp(part), widths) if multipliers else []
         for part in flat[entries:].reshape(len(vertices), -1)
     ]
-    return accepted_metric(weights, rows, 0.5 * (metric + metric.T), joint)
+    return accepted_metric(weights, readout, 0.5 * (metric + metric.T), joint)
 
 
 def accepted_metric(
-    weights: Exported, rows: Matrix, metric: Matrix, joint: list[list[Vector]]
+    weights: Exported, readout: Matrix, metric: Matrix, joint: list[list[Vector]]
 ) -> OutputMetric:
     """Return the smallest constants that the core accepts in a metric.
 
     Args:
         weights: of the model.
-        rows: C of the output.
+        readout: C of the output.
         metric: P.
         joint: multipliers of every vertex.
 
@@ -274,13 +275,15 @@ def accepted_metric(
         eigenvalues, _, _ = reduced(step.residual, multipliers, vertex)
         squares.append(eigenvalues[-1])
     # C P⁻¹ C', without the inverse of an ill-conditioned P.
-    squared_output = rows @ np.linalg.solve(metric, rows.T)
+    squared_output = readout @ np.linalg.solve(metric, readout.T)
     sizes = np.sqrt([max(squares), np.max(np.linalg.eigvalsh(squared_output))])
     # The eigenvalues are rounded. The core decides with how little slack they hold.
     for slack in SLACKS:
         alpha, lipschitz = map(float, COMPILATION_SLACK * sizes * (1 + slack))
-        claim = OutputMetric(alpha, lipschitz, metric, joint)
-        reads = reads_within(rows, lipschitz, metric)
+        claim = OutputMetric(
+            alpha=alpha, lipschitz=lipschitz, metric=rows(metric), joint=rows(joint)
+        )
+        reads = reads_within(readout, lipschitz, metric)
         if alpha < 1.0 and reads and contracts(claim, weights):
             return claim
     raise refusal

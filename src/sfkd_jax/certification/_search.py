@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import scipy  # its parts are imported where they are used, not to verify
 
+from sfkd_jax.certificate import Claims, Witnesses
 from sfkd_jax.certification._claims import (
     COMPILATION_SLACK,
-    Claims,
     decoders,
     hull_scope,
-    listed,
     readouts,
+    rows,
 )
 from sfkd_jax.certification._core import (
     Matrix,
@@ -39,7 +38,7 @@ INFEASIBLE = 1e3
 
 
 @one_thread()
-def prove(weights: Exported) -> Claims:
+def prove_claims(weights: Exported) -> Claims:
     """Search for the smallest constants that the core accepts.
 
     Raises:
@@ -53,14 +52,15 @@ def prove(weights: Exported) -> Claims:
     require(np.isfinite(beta), f"{unproved} residual")
     rho = COMPILATION_SLACK * max(map(norm_upper, weights.operators.vertices))
     alpha_joint, joint_multipliers = joint_bound(weights, multipliers)
-    witnesses: dict[str, Any] = {"residual": multipliers, "joint": joint_multipliers}
     lipschitz = {
-        name: COMPILATION_SLACK * norm_upper(rows)
-        for name, rows in readouts(weights).items()
+        name: COMPILATION_SLACK * norm_upper(matrix)
+        for name, matrix in readouts(weights).items()
     }
+    of_decoders = {}
     for name, network in decoders(weights).items():
-        bound, witnesses[name] = _best_multipliers(network, weights.decoder_multipliers)
+        bound, proving = _best_multipliers(network, weights.decoder_multipliers)
         lipschitz[name] = COMPILATION_SLACK * bound
+        of_decoders[name] = rows(proving)
     require(np.all(np.isfinite([*lipschitz.values()])), f"{unproved} decoder")
     alpha_separate = rho + beta
     return Claims(
@@ -71,7 +71,11 @@ def prove(weights: Exported) -> Claims:
         rho=rho,
         beta=beta,
         lipschitz=lipschitz,
-        witnesses=listed(witnesses),
+        witnesses=Witnesses(
+            residual=rows(multipliers),
+            joint=rows(joint_multipliers),
+            decoders=of_decoders,
+        ),
     )
 
 

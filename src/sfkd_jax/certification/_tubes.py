@@ -7,30 +7,29 @@ They follow from the corrected theorem on input-to-state stability of the paper
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.certification._claims import (
-    readouts,
+from sfkd_jax.certificate import (
+    Bounds,
+    Coverage,
+    OutputBound,
+    OutputMetric,
+    OutputTube,
+    StepErrors,
+    Tube,
 )
+from sfkd_jax.certification._claims import rows
 from sfkd_jax.certification._measured import (
     Residuals,
     conformal_bounds,
     conformal_quantile,
     coverage,
-    coverage_interval,
+    coverage_of,
 )
-from sfkd_jax.certification._metric_claims import (
-    OUTPUTS,
-    OutputMetric,
-)
-from sfkd_jax.certification._metrics import propose_metric
-from sfkd_jax.certification._weights import CertificationRefused, Exported
+from sfkd_jax.certification._metric_claims import OUTPUTS
 
-WORST = 5
-"""Number of steps of every validation run that a metric is optimised for."""
 RADII = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
 """Names of radii in a document, and of the outputs whose errors they bound."""
 
@@ -62,11 +61,11 @@ def tubes(
     *,
     alpha: float,
     lipschitz: Mapping[str, float],
-    one_step: Mapping[str, float],
+    one_step: StepErrors,
     horizon: int,
     largest_increment: float | None,
-) -> dict[str, Any]:
-    """Return the tubes of a document, for predictions that start at the true z_0.
+) -> Tube:
+    """Return the tubes of a certificate, for predictions that start at the true z_0.
 
     They are the radii R_1 … R_T of `latent_tube`, those of the outputs, and their
     limits. Along a path all outputs are decoded from z, so that no error accumulates:
@@ -82,18 +81,17 @@ def tubes(
     Args:
         alpha: contraction factor α.
         lipschitz: L of the outputs, by "position", "yaw", "body".
-        one_step: measured bounds at the true latent: d̄ ("latent"), and ε by the names
-            of the outputs.
+        one_step: measured bounds at the true latent: d̄, and ε of the outputs.
         horizon: T [steps].
         largest_increment: |dp|, the longest step [m]; None along a path.
     """
-    latent = latent_tube(alpha, one_step["latent"], horizon)
+    latent = latent_tube(alpha, one_step.latent, horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
-    ultimate = one_step["latent"] / (1 - alpha)
+    ultimate = one_step.latent / (1 - alpha)
     # R_0 … R_{T−1}, and the limit. R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1], [ultimate]])
     radii = {
-        name: lipschitz[output] * alpha * before + one_step[output]
+        name: lipschitz[output] * alpha * before + getattr(one_step, output)
         for name, output in RADII.items()
     }
     limits = None
@@ -101,19 +99,19 @@ def tubes(
         limits = {name: float(radius[-1]) for name, radius in radii.items()}
     else:
         # Errors of increments add up, so that the pose has no limit.
-        yaw = np.cumsum(lipschitz["yaw"] * before + one_step["yaw"])
+        yaw = np.cumsum(lipschitz["yaw"] * before + one_step.yaw)
         # An error of yaw moves only the increments that come after it.
         yaw_before = np.concatenate([[0.0], yaw[:-1]])
-        increments = lipschitz["position"] * before + one_step["position"]
+        increments = lipschitz["position"] * before + one_step.position
         radii["position_m"] = np.cumsum(increments + largest_increment * yaw_before)
         radii["yaw_rad"] = yaw
-    return {
-        "latent": latent.tolist(),
-        "physical": {name: radius[:-1].tolist() for name, radius in radii.items()},
-        "ultimate": ultimate,
-        "asymptotic": limits,
-        "largest_increment_m": largest_increment,
-    }
+    return Tube(
+        latent=rows(latent),
+        physical={name: rows(radius[:-1]) for name, radius in radii.items()},
+        ultimate=ultimate,
+        asymptotic=limits,
+        largest_increment_m=largest_increment,
+    )
 
 
 FORMS = ("asymptotic", "vehicle_to_nominal")
@@ -143,7 +141,7 @@ def radii(
         start: z_0 − ẑ_0; None if the nominal model starts at the state of the car.
     """
     # |d|_P is the 2-norm of d'L with P = L L'.
-    factor = np.linalg.cholesky(claim.metric)
+    factor = np.linalg.cholesky(np.asarray(claim.metric))
     disturbances = np.linalg.norm(measured.gaps @ factor, axis=-1)
     errors = measured.outputs[..., OUTPUTS.index(name)]
     if start is None:
@@ -165,63 +163,34 @@ def radii(
     return dict(zip(FORMS, (asymptotic, farthest), strict=True))
 
 
-def output_tubes(
-    weights: Exported,
-    validation: Residuals,
+def measure_outputs(
+    outputs: Mapping[str, OutputMetric],
     calibration: Residuals,
     test: Residuals,
     *,
     level: float,
-    start: np.ndarray | None = None,
-) -> dict[str, dict[str, Any]]:
-    """Prove a metric for each of `OUTPUTS` and calibrate a bound on |y − ŷ| with it.
+) -> dict[str, OutputTube]:
+    """Calibrate bounds on |y − ŷ| of the outputs that have a metric.
 
     Args:
-        weights: of the model.
-        validation: errors of runs that the metrics are optimised for.
+        outputs: proved metrics by name.
         calibration: errors of runs that set the bounds.
         test: errors of runs on which coverage is counted.
         level: with which each bound holds for a whole new run.
-        start: common Lyapunov matrix of the operators, where the search begins; None to
-            begin at I.
-
-    Returns:
-        The entries of the outputs by name. There is none if there is no metric for one
-        of them, because a corridor needs both position and heading.
     """
-    documents = {}
-    for name in OUTPUTS:
-        rows = readouts(weights)[name]
-        gaps = worst_gaps(validation)
-        try:
-            claim = propose_metric(weights, rows, gaps, start)
-        except CertificationRefused:
-            return {}
+    count = len(test.gaps)
+
+    def bound_of(scores: np.ndarray, unseen: np.ndarray) -> OutputBound:
+        radius = conformal_quantile(scores, level)
+        return OutputBound(radius=radius, coverage=coverage_of(unseen <= radius, count))
+
+    measured = {}
+    for name, claim in outputs.items():
         scores = radii(calibration, name, claim)
         unseen = radii(test, name, claim)
-        count = len(test.gaps)
-        bounds = {form: conformal_quantile(scores[form], level) for form in FORMS}
-        shares = {form: float(np.mean(unseen[form] <= bounds[form])) for form in FORMS}
-        documents[name] = {
-            **claim.document(),
-            "coverage_runs": count,
-            "tube": bounds,
-            "coverage": shares,
-            "coverage_ci95": {
-                form: coverage_interval(share, count) for form, share in shares.items()
-            },
-        }
-    return documents
-
-
-def worst_gaps(measured: Residuals) -> Float[np.ndarray, "run worst rank"]:
-    """Return d of the `WORST` steps of every run with the largest |d|.
-
-    These steps decide the radius of a tube, and so few keep the search fast.
-    """
-    sizes = np.linalg.norm(measured.gaps, axis=-1)
-    worst = np.argsort(sizes, axis=1)[:, -WORST:]
-    return np.take_along_axis(measured.gaps, worst[..., None], axis=1)
+        bounds = {form: bound_of(scores[form], unseen[form]) for form in FORMS}
+        measured[name] = OutputTube(**bounds)
+    return measured
 
 
 JOINT = ("vehicle_to_nominal_position", "vehicle_to_nominal_yaw", "nominal")
@@ -237,8 +206,8 @@ def calibrate_corridor(
     scores: Float[np.ndarray, "run 5"],
     *,
     level: float,
-) -> dict[str, float]:
-    """Return split-conformal bounds for a new run, by name.
+) -> Bounds:
+    """Return split-conformal bounds for a new run.
 
     The bounds in `JOINT` hold together with probability at least `level`, those in
     `ALONE` one by one. The joint score is mostly that of the lateral tube, since
@@ -254,12 +223,10 @@ def calibrate_corridor(
         reference[:, :joint_count], scores[:, :joint_count], level=level
     )
     alone = [conformal_quantile(column, level) for column in scores[:, joint_count:].T]
-    return dict(zip((*JOINT, *ALONE), [*joint.tolist(), *alone], strict=True))
+    return Bounds(**dict(zip((*JOINT, *ALONE), [*joint.tolist(), *alone], strict=True)))
 
 
-def corridor_coverage(
-    bounds: Mapping[str, float], scores: Float[np.ndarray, "run 5"]
-) -> dict[str, Any]:
+def corridor_coverage(bounds: Bounds, scores: Float[np.ndarray, "run 5"]) -> Coverage:
     """Return the share of runs on which all bounds in `JOINT` held."""
-    limits = np.asarray([bounds[name] for name in JOINT])
+    limits = np.asarray([getattr(bounds, name) for name in JOINT])
     return coverage(limits, scores[:, : len(JOINT)])

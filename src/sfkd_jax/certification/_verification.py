@@ -1,91 +1,145 @@
 """Verification of certificates from an untrusted source, without any search.
 
-`schema` gives every entry of a document one of three rules. The trusted core checks
-proved entries. Entries that follow are derived again from the policy and other entries.
-Measured entries lie in a range that the policy and other entries leave, within which
-only a signature could bind them.
+What is proved is checked by the trusted core, and what follows from it is computed
+again. A measured number can be bound to its author alone: the hash of the document
+covers it, and a signature of the hash says who measured it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from sfkd_jax.certification._certificate import Certificate, verify
-from sfkd_jax.certification._corridor_schema import corridor_rules, recorded_rules
-from sfkd_jax.certification._metric_claims import (
-    OutputMetric,
-    require_lyapunov,
-    require_output_metric,
-)
-from sfkd_jax.certification._rules import require_entry
-from sfkd_jax.certification._schema import (
-    Trained,
-    document_rules,
-    is_simulated,
-    settings_rules,
-)
+from sfkd_jax.certificate import Certificate
+from sfkd_jax.certification._proving import verify_proof
+from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.certification._weights import (
     CertificateStale,
-    Exported,
+    CertificationRefused,
     exported,
-    one_thread,
     require,
     well_formed,
 )
+from sfkd_jax.control import WINDOWS
+
+Trained: TypeAlias = Any
+"""A `policy.TrainedModel`: what a certificate is about."""
+
+REPEATED = 1e-9
+"""Relative tolerance of values that are computed again. The order of summation may be
+another one.
+"""
+ROUNDED = 1e-6
+"""The same of values that are float32 in one place, and float64 in another."""
 
 
-def verify_document(document: Mapping[str, Any], trained: Trained) -> None:
-    """Check a document from an untrusted source against a policy, without any search.
+def verify(certificate: Certificate, trained: Trained) -> None:
+    """Check a certificate from an untrusted source against a policy.
 
     Args:
-        document: from `certify`.
-        trained: the policy. The hash in the document is about its settings, too.
+        certificate: as it was read.
+        trained: the policy. The hash in the certificate is about its settings, too.
 
     Raises:
         CertificateStale: it is about other weights or settings.
         CertificationRefused: it does not hold; gives the reason.
     """
-    # `is not True`, because the text "false" or a number must not pass.
-    require(document.get("valid") is True, str(document.get("reason")))
+    provenance = certificate.provenance
     # The same weights under another controller are another policy. The hash therefore
     # covers the settings, too.
-    if document.get("policy_sha256") != trained.sha256:
+    hashes = (provenance.policy_sha256, provenance.weights_sha256)
+    if hashes != (trained.sha256, trained.weights_sha256):
         raise CertificateStale("the certificate is about other weights or settings")
     weights = exported(trained.model, trained.params)
+    proof = certificate.proof
+    verify_proof(proof, trained.model, trained.params, weights=weights)
     with well_formed(), np.errstate(all="ignore"):
-        require_entry("", document, schema(document, trained, weights))
-    # From here on all entries have the types that they should have.
-    proof = Certificate.from_document(document)
-    verify(proof, trained.params, model=trained.model, weights=weights)
-    with well_formed(), one_thread():
-        require_lyapunov(document["lyapunov"], weights)
-        for name, part in document["outputs"].items():
-            require_output_metric(name, OutputMetric.from_document(part), weights)
+        _require_what_follows(certificate, trained)
+        _require_sizes(certificate, trained)
 
 
-def schema(
-    document: Mapping[str, Any], trained: Trained, weights: Exported
-) -> dict[str, Any]:
-    """Return the rule of every entry that a document about this policy must have.
+def _require_what_follows(certificate: Certificate, trained: Trained) -> None:
+    """Refuse an entry that does not follow from the policy and other entries."""
+    proof = certificate.proof
+    measured = certificate.measured
+    stated = measured.tube
+    derived = tubes(
+        alpha=proof.alpha,
+        lipschitz=proof.lipschitz,
+        one_step=measured.d_bar.one_step,
+        horizon=len(stated.latent),
+        largest_increment=stated.largest_increment_m,
+    )
+    along_path = trained.model.along_path
+    require(
+        (stated.largest_increment_m is None) == along_path
+        and _near(vars(stated), vars(derived), REPEATED),
+        "measured.tube does not follow from the proof and d_bar",
+    )
+    environment = trained.settings["environment"]
+    box = [environment.get("low"), environment.get("high")]
+    # The environments of logs are measured, and the settings may state no box of them.
+    require(
+        None in box or _near(proof.env_box, box, ROUNDED),
+        "proof.env_box is not that of the policy",
+    )
+    require(
+        measured.boxes.env == proof.env_box, "measured.boxes.env is not proof.env_box"
+    )
+    corridor = certificate.corridor
+    if corridor is None:
+        return
+    for part in filter(None, (corridor, corridor.recorded)):
+        # The triangle inequality: from the car to the nominal model, and to the path.
+        width = part.bounds.nominal + part.bounds.vehicle_to_nominal_position
+        require(
+            _near(part.corridor_m, width, REPEATED),
+            "corridor.corridor_m does not follow from its bounds",
+        )
 
-    Entries without a rule are refused.
 
-    Args:
-        document: the certificate.
-        trained: the policy.
-        weights: its explicit weights.
+def _require_sizes(certificate: Certificate, trained: Trained) -> None:
+    """Refuse lists of other lengths than the policy has, which readers would index."""
+    space = trained.settings["space"]
+    boxes = certificate.measured.boxes
+    for box, part in (("state", "body"), ("control", "control"), ("env", "env")):
+        low, _ = getattr(boxes, box)
+        fits = len(low) == len(space[f"{part}_mean"])
+        require(fits, f"measured.boxes.{box} is of another size than the policy")
+    corridor = certificate.corridor
+    require(
+        certificate.measured.outputs.keys() == certificate.proof.outputs.keys(),
+        "measured.outputs are not those of the proof",
+    )
+    if corridor is None:
+        return
+    law = trained.law
+    if law is None or not certificate.proof.outputs:
+        raise CertificationRefused("a corridor needs a law and metrics of the outputs")
+    charts = law.gain.shape[-1] + 1
+    innovations = corridor.innovations
+    shape = (len(innovations.levels), charts)
+    fits = (
+        np.shape(innovations.deviation) == shape
+        and np.shape(innovations.threshold) == (len(WINDOWS), charts)
+        and len(corridor.conditions.env_box[0]) == len(space["env_mean"])
+    )
+    require(fits, "corridor is of another size than the policy")
+
+
+def _near(stated: Any, derived: Any, tolerance: float) -> bool:
+    """Return whether numbers in equal structures are nearly equal, relative to derived.
+
+    A forger can choose the stated value, and not the derived one.
     """
-    rules = document_rules(document, trained, weights)
-    if document["outputs"] != {}:
-        # Logs have no plant that could be driven, and no corridor.
-        if is_simulated(trained):
-            rules["corridor"] = corridor_rules(document, trained)
-        if "recorded" in document:
-            rules["recorded"] = recorded_rules(document)
-    # A certificate that no command has made states no settings of one.
-    if "certification" in document:
-        rules["certification"] = settings_rules(document)
-    return rules
+    if isinstance(derived, dict):
+        return stated.keys() == derived.keys() and all(
+            _near(stated[key], derived[key], tolerance) for key in derived
+        )
+    if derived is None or stated is None:
+        return stated is derived
+    expected = np.asarray(derived, float)
+    actual = np.asarray(stated, float)
+    near = np.abs(actual - expected) <= tolerance * np.abs(expected)
+    return actual.shape == expected.shape and bool(np.all(near))

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sfkd_jax.certificate import CorridorAttack, OutputMetric
 from sfkd_jax.certification._alarms import Loop
 from sfkd_jax.certification._attack import CertificateContradicted
-from sfkd_jax.certification._metric_claims import OutputMetric
 from sfkd_jax.control import safety_filter
 from sfkd_jax.geometry import (
     LATERAL,
@@ -235,8 +235,8 @@ def outcome_of(
 
 def attack_corridor(
     search: WorstRuns, key: Key, width: float, horizon: int
-) -> dict[str, Any]:
-    """Search for the worst runs, repeat them with the shield, and return the entry.
+) -> CorridorAttack:
+    """Search for the worst runs, and repeat them with the shield.
 
     Args:
         search: of the worst runs.
@@ -282,16 +282,16 @@ def attack_corridor(
             f"INTERNAL ERROR: {distance:.4f} m from the nominal model, "
             f"and the tube is {bound:.4f} m"
         )
-    return {
-        "steps": search.steps,
-        "lateral_m": float(np.nanmax(outcome.lateral)),
-        "distance_m": float(np.nanmax(outcome.distance)),
-        "shielded_lateral_m": float(np.nanmax(kept.lateral)),
-        "kept_lateral_m": lateral,
-        "kept_distance_m": distance,
-        "over_corridor": lateral / (width + bound),
-        "over_tube": distance / bound,
-    }
+    return CorridorAttack(
+        steps=search.steps,
+        lateral_m=float(np.nanmax(outcome.lateral)),
+        distance_m=float(np.nanmax(outcome.distance)),
+        shielded_lateral_m=float(np.nanmax(kept.lateral)),
+        kept_lateral_m=lateral,
+        kept_distance_m=distance,
+        over_corridor=lateral / (width + bound),
+        over_tube=distance / bound,
+    )
 
 
 def _largest(values: Array, chosen: np.ndarray) -> float:

@@ -18,6 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sfkd_jax.certificate import (
+    Bounds,
+    Conditions,
+    Corridor,
+    GroupBounds,
+    JointBounds,
+    OutputMetric,
+    Recorded,
+    RecordedConditions,
+    Seen,
+)
 from sfkd_jax.certification._alarms import (
     Loop,
     calibrate_innovations,
@@ -26,9 +37,10 @@ from sfkd_jax.certification._alarms import (
     simulate_nominal,
 )
 from sfkd_jax.certification._alarms import closed_loop as closed_loop
+from sfkd_jax.certification._claims import rows
 from sfkd_jax.certification._measured import check_count as check_count
 from sfkd_jax.certification._measured import conformal_bounds, residuals
-from sfkd_jax.certification._metric_claims import OUTPUTS, OutputMetric
+from sfkd_jax.certification._metric_claims import OUTPUTS
 from sfkd_jax.certification._tubes import (
     ALONE,
     FORMS,
@@ -56,9 +68,9 @@ ALARM_STREAM = 5
 """The same for the test of innovations."""
 
 
-def certify_corridor(
+def measure_corridor(
     loop: Loop,
-    outputs: Mapping[str, Any],
+    claims: Mapping[str, OutputMetric],
     data: Mapping[str, Any],
     level: float,
     *,
@@ -67,8 +79,9 @@ def certify_corridor(
     dwell: Span = (3.0, 6.0),
     horizon: int = 20,
     attack_steps: int = 200_000,
-) -> dict[str, Any]:
-    """Return the entry of the certificate about the corridor.
+    identified_from: str | None = None,
+) -> Corridor:
+    """Return the corridor of a policy, measured on simulated runs.
 
     Of each group of drives one part of `runs` fixes the units, one calibrates and one
     tests. The bounds are those of the worst group. Runs of S3 are tested too, although
@@ -76,7 +89,7 @@ def certify_corridor(
 
     Args:
         loop: of the policy.
-        outputs: that part of the document, with a proved metric of each output.
+        claims: proved metrics by the names of the outputs.
         data: settings of the data set: `ROAD_SETTINGS`, `EXCITATION`, env_low,
             env_high, seed and law.
         level: 1 − δ.
@@ -85,13 +98,13 @@ def certify_corridor(
         dwell: range of times between switches [s].
         horizon: preview of the shield [steps].
         attack_steps: number of steps of the search for runs that leave the corridor.
+        identified_from: hash of the logs if the plant is a model of logs.
 
     Raises:
         ValueError: too few runs for the level.
         CertificateContradicted: the attack contradicts a bound.
     """
     began = time.perf_counter()
-    claims = _claims_of(outputs)
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
@@ -103,55 +116,61 @@ def certify_corridor(
         _measure(loop, claims, simulate, driver(run_key), key)
         for driver, run_key, key in zip(drivers, run_keys, sensor_keys, strict=True)
     )
-    bounds, shares = _worst_group(units.scores, calibration.scores, test.scores, level)
-    tube = bounds["vehicle_to_nominal_position"]
+    bounds, groups = _bounds_of_groups(
+        units.scores, calibration.scores, test.scores, level
+    )
+    tube = bounds.vehicle_to_nominal_position
     # The shortest dwell: an attack switches as often as the conditions allow.
     dwell_steps = max(1, round(dwell[0] / loop.plant.dt))
     search = WorstRuns(loop, claims["position"], tube, data, dwell_steps, attack_steps)
     observe = partial(_observed, jax.jit(partial(innovations, loop)))
     observers = (partial(observe, drive), partial(observe, drive_s3))
     alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
-    entry = {
-        "conditions": _conditions(loop, data, duration, dwell),
-        "level": level,
-        "runs": runs,
-        "bounds": bounds,
-        "corridor_m": bounds["nominal"] + tube,
-        **shares,
+    coverages = [group.coverage for group in groups.values()]
+    return Corridor(
+        conditions=_conditions(loop, data, duration, dwell, identified_from),
+        level=level,
+        runs=runs,
+        bounds=bounds,
+        corridor_m=bounds.nominal + tube,
+        coverage=min(coverages, key=lambda coverage: coverage.share),
+        by_group=groups,
         # Reported beside the claim and no part of it, since S3 does not meet the
         # conditions.
-        "by_scenario": {"s3": corridor_coverage(bounds, s3.scores)},
-        "seen": test.largest(),
-    }
-    failed = sum(part.failed for part in (units, calibration, test, s3))
-    if failed:
-        entry["failed_runs"] = failed
-    entry["attack"] = attack_corridor(search, attack_key, bounds["nominal"], horizon)
-    entry["innovations"] = alarms
-    entry["shield_horizon"] = horizon
-    entry["seconds"] = time.perf_counter() - began
-    return entry
-
-
-def _claims_of(outputs: Mapping[str, Any]) -> dict[str, OutputMetric]:
-    """Return the claims about outputs in a document, by name."""
-    return {name: OutputMetric.from_document(part) for name, part in outputs.items()}
+        by_scenario={"s3": corridor_coverage(bounds, s3.scores)},
+        seen=test.largest(),
+        attack=attack_corridor(search, attack_key, bounds.nominal, horizon),
+        innovations=alarms,
+        failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
+        shield_horizon=horizon,
+        seconds=time.perf_counter() - began,
+    )
 
 
 def _conditions(
-    loop: Loop, data: Mapping[str, Any], duration: float, dwell: tuple[float, float]
-) -> dict[str, Any]:
+    loop: Loop,
+    data: Mapping[str, Any],
+    duration: float,
+    dwell: tuple[float, float],
+    identified_from: str | None,
+) -> Conditions:
     """Return the conditions that the runs of a corridor meet."""
-    return {
-        **drive_class(data),
-        **{name: data[name] for name in EXCITATION},
-        "env_box": [data["env_low"], data["env_high"]],
-        "dwell_s": dwell,
-        "duration_s": duration,
-        "sensor_noise": loop.noise,
-        "perturbation": loop.law.perturbation.tolist(),
-        "law_model": data["law"]["model"],
+    settings = {name: data[name] for name in (*ROAD_SETTINGS, *EXCITATION)}
+    # Pairs of numbers come as lists, from JSON.
+    known: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in settings.items()
     }
+    return Conditions(
+        **known,
+        env_box=rows((data["env_low"], data["env_high"])),
+        dwell_s=dwell,
+        duration_s=duration,
+        sensor_noise=loop.noise,
+        perturbation=rows(np.asarray(loop.law.perturbation)),
+        law_model=data["law"]["model"],
+        identified_from=identified_from,
+    )
 
 
 def _drivers(
@@ -203,43 +222,47 @@ def _driver(
 
 
 def scores_of_runs(
-    loop: Loop, document: Mapping[str, Any], runs: Trajectory
+    loop: Loop, claims: Mapping[str, OutputMetric], runs: Trajectory
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the scores of recorded runs and their e_y (run, time).
 
     They are computed as those of simulated runs. The state of the vehicle is what its
     sensors show, for the nominal model too.
     """
-    claims = _claims_of(document["outputs"])
     simulate = jax.jit(partial(simulate_nominal, loop))
     measured = _measure(loop, claims, simulate, runs, jax.random.key(0))
     return measured.scores, measured.lateral
 
 
 def calibrate_on_runs(
-    document: Mapping[str, Any], scores: np.ndarray, level: float
-) -> dict[str, Any]:
-    """Return the part `recorded` of a certificate.
+    simulated: Bounds,
+    scores: np.ndarray,
+    level: float,
+    conditions: RecordedConditions,
+) -> Recorded:
+    """Return the corridor of recorded runs.
 
-    The units are the bounds of the document, which these runs have not made. The
+    The units are the bounds of simulated runs, which these runs have not made. The
     nominal corridor is not narrower than there, because the shield keeps the width with
     which these runs were driven.
 
     Args:
-        document: the certificate.
+        simulated: bounds of the certificate.
         scores: of `scores_of_runs`.
         level: 1 − δ.
+        conditions: of the runs.
     """
-    simulated = document["corridor"]["bounds"]
-    units = np.asarray([[simulated[name] for name in JOINT]])
+    units = np.asarray([[getattr(simulated, name) for name in JOINT]])
     joint = conformal_bounds(units, scores[:, : len(JOINT)], level=level)
-    bounds = dict(zip(JOINT, joint.tolist(), strict=True))
-    bounds["nominal"] = max(bounds["nominal"], simulated["nominal"])
-    return {
-        "bounds": bounds,
-        "corridor_m": bounds["nominal"] + bounds["vehicle_to_nominal_position"],
-        "level": level,
-    }
+    by_name = dict(zip(JOINT, joint.tolist(), strict=True))
+    by_name["nominal"] = max(by_name["nominal"], simulated.nominal)
+    bounds = JointBounds(**by_name)
+    return Recorded(
+        bounds=bounds,
+        corridor_m=bounds.nominal + bounds.vehicle_to_nominal_position,
+        level=level,
+        conditions=conditions,
+    )
 
 
 def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -247,13 +270,13 @@ def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
     return {name: data[name] for name in ROAD_SETTINGS}
 
 
-def _worst_group(
+def _bounds_of_groups(
     units: np.ndarray,
     calibration: np.ndarray,
     test: np.ndarray,
     level: float,
-) -> tuple[dict[str, float], dict[str, Any]]:
-    """Return the bounds of the worst group, and their coverage on every group.
+) -> tuple[Bounds, dict[str, GroupBounds]]:
+    """Return the bounds of the worst group, and bounds and coverage of every group.
 
     Args:
         units: scores of the runs that fix the units, group after group.
@@ -271,19 +294,18 @@ def _worst_group(
         # Runs in which a simulator failed fix no units.
         finite = unit_scores[np.isfinite(unit_scores[:, 0])]
         bounds_of_groups[name] = calibrate_corridor(finite, scores, level=level)
-    bounds = {
-        name: max(of_group[name] for of_group in bounds_of_groups.values())
+    worst = {
+        name: max(getattr(bounds, name) for bounds in bounds_of_groups.values())
         for name in (*JOINT, *ALONE)
     }
-    shares = {
-        name: corridor_coverage(bounds, scores)
+    bounds = Bounds(**worst)
+    groups = {
+        name: GroupBounds(
+            bounds=bounds_of_groups[name], coverage=corridor_coverage(bounds, scores)
+        )
         for name, scores in zip(DRIVES, test_of_groups, strict=True)
     }
-    least = min(shares.values(), key=lambda share: share["coverage"])
-    groups = {
-        name: {"bounds": bounds_of_groups[name], **shares[name]} for name in DRIVES
-    }
-    return bounds, {**least, "by_group": groups}
+    return bounds, groups
 
 
 class _Part(NamedTuple):
@@ -306,12 +328,12 @@ class _Part(NamedTuple):
         """Number of runs in which a simulator failed."""
         return int(np.isinf(self.scores[:, 0]).sum())
 
-    def largest(self) -> dict[str, float]:
-        """Return how far the car came from the nominal model and from the path [m]."""
-        return {
-            "distance_m": float(np.nanmax(np.abs(self.lateral - self.nominal))),
-            "lateral_m": float(np.nanmax(np.abs(self.lateral))),
-        }
+    def largest(self) -> Seen:
+        """Return how far the car came from the nominal model and from the path."""
+        return Seen(
+            distance_m=float(np.nanmax(np.abs(self.lateral - self.nominal))),
+            lateral_m=float(np.nanmax(np.abs(self.lateral))),
+        )
 
 
 def _measure(

@@ -8,7 +8,6 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sfkd_jax import build, store
 from sfkd_jax.data import (
@@ -24,7 +23,7 @@ from sfkd_jax.experiment.laws import without_faults
 from sfkd_jax.experiment.options import DatasetSettings
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import arguments
-from sfkd_jax.types import BODY, Key, Trajectory
+from sfkd_jax.types import Key, Trajectory
 
 SWITCHING_STREAM = 2
 """The stream of runs of S3, folded into the data set's seed. Simulation and split use 0
@@ -94,31 +93,6 @@ def simulate(
         scenarios=jnp.asarray(labels),
         **box,
     )
-
-
-def boxes(dataset: Dataset) -> dict[str, list[list[float]]]:
-    """Return the boxes of body state, control and environment: [low, high] of each.
-
-    Those of body state and control are hulls over training and calibration parts; that
-    of the environment is E.
-    """
-    train = dataset.train
-    calibration = dataset.calibration
-    return {
-        "state": _hull(train.states[..., BODY], calibration.states[..., BODY]),
-        "control": _hull(train.controls, calibration.controls),
-        "env": [
-            np.asarray(dataset.env_low).tolist(),
-            np.asarray(dataset.env_high).tolist(),
-        ],
-    }
-
-
-def _hull(*arrays: Any) -> list[list[float]]:
-    """Return the smallest and the largest value of each entry of the last axis."""
-    rows = [np.reshape(array, (-1, array.shape[-1])) for array in arrays]
-    flat = np.concatenate(rows)
-    return [flat.min(axis=0).tolist(), flat.max(axis=0).tolist()]
 
 
 def by_scenario(dataset: Dataset) -> dict[str, Trajectory]:

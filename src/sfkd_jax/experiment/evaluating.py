@@ -253,7 +253,8 @@ def has_course(scenario: ScenarioSettings) -> bool:
 
 def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controller:
     """Return a controller of scenes around one of references."""
-    if system.law is None or not (system.certificate or {}).get("corridor"):
+    certificate = system.certificate
+    if system.law is None or certificate is None or certificate.corridor is None:
         raise ValueError(
             f"scenario={run.settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
@@ -262,7 +263,7 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
         inner,
         run.plant,
         system.law,
-        system.certificate or {},
+        certificate,
         horizon=run.settings.controller.horizon,
         car=run.plant.size,
         planner="mppi",
@@ -288,7 +289,7 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
         "episodes": protocol.episodes,
         "episode_s": protocol.episode_s,
         "params": sum(leaf.size for leaf in leaves) or None,
-        "alpha": certificate["alpha"] if certificate else None,
+        "alpha": certificate.proof.alpha if certificate else None,
     }
 
 

@@ -16,8 +16,8 @@ from sfkd_jax.build import (
     ScenarioSettings,
     VehicleSettings,
 )
-from sfkd_jax.certification import issue
-from sfkd_jax.certification.corridor import certify_corridor
+from sfkd_jax.certification import measure, prove
+from sfkd_jax.certification.corridor import measure_corridor
 from sfkd_jax.plants import KNOWN_STATES, Vehicle, described
 from sfkd_jax.ranges import (
     Bounds,
@@ -162,22 +162,27 @@ class TrainingSettings:
 
 
 @takes(
-    issue,
+    prove,
+    measure,
     skip=("validation", "calibration", "held_out", "boxes", "runs"),
-    corridor=schema("Corridor", object, certify_corridor),
+    corridor=schema("Corridor", object, measure_corridor, skip=("identified_from",)),
 )
 class CertificationSettings:
-    """What is proved and measured; the other fields are arguments of `issue`.
+    """What is proved and measured, and who signs it.
+
+    The other fields are arguments of `certification.prove` and `measure`.
 
     Attributes:
-        corridor: of `certification.corridor.certify_corridor`.
+        corridor: of `certification.corridor.measure_corridor`.
         renew: whether `certify` replaces a certificate of other weights.
+        signing_key: path of a private ed25519 key in PEM that signs the certificate.
         horizon: number of steps of the tubes.
         level: share of runs that the tubes shall contain.
     """
 
     corridor: Any
     renew: bool = False
+    signing_key: str | None = None
     horizon: int = 20
     level: Fraction = 0.95
 

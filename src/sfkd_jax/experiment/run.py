@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import store
+from sfkd_jax.certification import boxes_of
 from sfkd_jax.certification.corridor import check_count
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset
-from sfkd_jax.experiment import data, run_directory
+from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import train_policy
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.experiment.source import DataSource
@@ -147,7 +148,7 @@ class Run:
             recorded["environment"] = box
             vehicle = recorded["vehicle"]
             if vehicle["name"] == "own" and not vehicle["control_low"]:
-                low, high = data.boxes(dataset)["control"]
-                vehicle["control_low"] = low
-                vehicle["control_high"] = high
+                low, high = boxes_of(dataset).control
+                vehicle["control_low"] = list(low)
+                vehicle["control_high"] = list(high)
         return recorded

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from sfkd_jax import build, policy, store
-from sfkd_jax.certification import CertificationRefused, issue
-from sfkd_jax.certification.corridor import certify_corridor, closed_loop
+from sfkd_jax.certificate import (
+    AxisNames,
+    Certificate,
+    Corridor,
+    Proof,
+    Provenance,
+    Refusal,
+    private_key,
+    write,
+)
+from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
+from sfkd_jax.certification.corridor import closed_loop, measure_corridor
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import check_shares
-from sfkd_jax.experiment import data
 from sfkd_jax.experiment.options import (
     CertificationSettings,
     EnvironmentSettings,
@@ -118,99 +129,115 @@ def _zero_law(sizes: _Sizes) -> PathLaw:
     )
 
 
-def certify_policy(run: Run) -> dict[str, Any]:
-    """Certify the policy of the run, and write and return the document.
-
-    A refusal is a document too: `valid` is false, and `reason` is given.
-    """
+def certify_policy(run: Run) -> Certificate | Refusal:
+    """Certify the policy of the run, and write and return the certificate."""
     began = time.perf_counter()
+    settings = run.settings.certification
+    if settings.signing_key is not None:
+        # Whether it is a key is known before the hours that the rest may take.
+        private_key(settings.signing_key)
     trained = run.policy
+    provenance = Provenance(
+        policy_sha256=trained.sha256,
+        weights_sha256=trained.weights_sha256,
+        versions={**store.versions(), "scipy": version("scipy")},
+        seconds=0.0,
+        settings=_recorded_certification(settings),
+    )
     try:
-        document = _certify_tubes(run, trained)
+        certificate: Certificate | Refusal = _certify(run, trained, provenance)
     except CertificationRefused as reason:
-        document = {"valid": False, "reason": str(reason)}
-    document["weights_sha256"] = trained.weights_sha256
-    document["policy_sha256"] = trained.sha256
-    document["certification"] = _recorded_certification(run.settings.certification)
-    # The proof's own versions win: they are of the libraries that computed it.
-    document["versions"] = {**store.versions(), **document.get("versions", {})}
-    document["seconds"] = time.perf_counter() - began
-    store.write_json(run.certificate_path, document)
-    store.print_message(f"certificate: {_verdict(document)}")
-    lyapunov_refused = document.get("lyapunov", {}).get("reason")
-    if lyapunov_refused:
-        store.print_message(f"certificate: {lyapunov_refused}")
-    return document
+        certificate = Refusal(reason=str(reason), provenance=provenance)
+    seconds = time.perf_counter() - began
+    provenance = dataclasses.replace(certificate.provenance, seconds=seconds)
+    certificate = dataclasses.replace(certificate, provenance=provenance)
+    write(run.certificate_path, certificate, signing_key=settings.signing_key)
+    store.print_message(f"certificate: {_verdict(certificate, settings)}")
+    if isinstance(certificate, Certificate) and certificate.proof.lyapunov_refused:
+        store.print_message(f"certificate: {certificate.proof.lyapunov_refused}")
+    return certificate
 
 
-def _verdict(document: dict[str, Any]) -> str:
+def _verdict(
+    certificate: Certificate | Refusal, settings: CertificationSettings
+) -> str:
     """Return what a certificate proves and measures, in one line."""
-    verdict = f"refused: {document.get('reason')}"
-    if document["valid"]:
-        verdict = f"alpha {document['alpha']:.6f}"
-    if corridor := document.get("corridor"):
-        verdict += f"; corridor {corridor['corridor_m']:.3f} m to each side, measured"
-        if "identified_from" in corridor["conditions"]:
+    if isinstance(certificate, Refusal):
+        return f"refused: {certificate.reason}"
+    verdict = f"alpha {certificate.proof.alpha:.6f}"
+    if corridor := certificate.corridor:
+        verdict += f"; corridor {corridor.corridor_m:.3f} m to each side, measured"
+        if corridor.conditions.identified_from is not None:
             verdict += " on the model of the logs, not on the car"
-    if d_bar := document.get("d_bar"):
-        holds = f"holds for {d_bar['holds_for']} (measured, unsigned)"
-        verdict += f"; d_bar {d_bar['value']:.4g} {holds}"
-    return verdict
+    d_bar = certificate.measured.d_bar
+    signature = "signed" if settings.signing_key else "unsigned"
+    holds = f"holds for {d_bar.holds_for} (measured, {signature})"
+    return f"{verdict}; d_bar {d_bar.one_step.latent:.4g} {holds}"
 
 
 def _recorded_certification(settings: CertificationSettings) -> dict[str, Any]:
     """Return the settings of the certification that a certificate records."""
     recorded = store.plain(settings)
-    # `renew` says what to do, not what is claimed.
+    # They say what to do, and not what is claimed.
     del recorded["renew"]
+    del recorded["signing_key"]
     return recorded
 
 
-def _certify_tubes(run: Run, trained: policy.TrainedModel) -> dict[str, Any]:
-    """Certify the steps of a model, with tubes calibrated on the data of the run."""
+def _certify(
+    run: Run, trained: policy.TrainedModel, provenance: Provenance
+) -> Certificate:
+    """Prove, and measure on the data of the run and on runs of its vehicle."""
     dataset = run.source.dataset
-    boxes: dict[str, Any] = data.boxes(dataset)
+    settings = run.settings.certification
+    boxes = boxes_of(dataset)
     if logs := run.source.logs:
-        boxes["names"] = _column_names(logs, run.settings.environment)
-    document = issue(
+        names = _column_names(logs, run.settings.environment)
+        boxes = dataclasses.replace(boxes, names=names)
+    began = time.perf_counter()
+    proof = prove(
         trained.model,
         trained.params,
+        boxes.env,
+        validation=dataset.validation,
+        **arguments(settings, prove),
+    )
+    seconds = time.perf_counter() - began
+    measured = measure(
+        trained.model,
+        trained.params,
+        proof,
         validation=dataset.validation,
         calibration=dataset.calibration,
         held_out=run.source.held_out,
         boxes=boxes,
         runs=dataset.runs,
-        **arguments(run.settings.certification, issue),
+        **arguments(settings, measure),
     )
+    corridor = None
     # Logs have no plant to drive: a corridor needs runs under known conditions.
-    if document["outputs"] and run.source.logs is None:
-        document["corridor"] = _measure_corridor(run, trained, document["outputs"])
-    return document
+    if proof.outputs and run.source.logs is None:
+        corridor = _measure_corridor(run, trained, proof)
+    return Certificate(
+        proof=proof,
+        measured=measured,
+        corridor=corridor,
+        provenance=dataclasses.replace(provenance, seconds_proof=seconds),
+    )
 
 
-def _column_names(
-    logs: LogSettings, environment: EnvironmentSettings
-) -> dict[str, Any]:
+def _column_names(logs: LogSettings, environment: EnvironmentSettings) -> AxisNames:
     """Return the names of the axes of the boxes, from the columns of the logs."""
     env = logs.columns.environment if environment.is_known else ()
-    names = {
-        "state": logs.columns.state[BODY],
-        "control": logs.columns.control,
-        "env": env,
-    }
-    return store.plain(names)
+    return AxisNames(
+        state=tuple(logs.columns.state[BODY]),
+        control=tuple(logs.columns.control),
+        env=tuple(env),
+    )
 
 
-def _measure_corridor(
-    run: Run, trained: policy.TrainedModel, outputs: Any
-) -> dict[str, Any]:
-    """Return the corridor of a policy, measured on runs of its vehicle.
-
-    Args:
-        run: whose policy it is.
-        trained: the policy.
-        outputs: the outputs of its certificate.
-    """
+def _measure_corridor(run: Run, trained: policy.TrainedModel, proof: Proof) -> Corridor:
+    """Return the corridor of a policy, measured on runs of its vehicle."""
     settings = run.settings
     loop = closed_loop(
         run.plant,
@@ -219,16 +246,14 @@ def _measure_corridor(
         trained.law,
         run.sensors,
     )
-    corridor = certify_corridor(
+    return measure_corridor(
         loop,
-        outputs,
+        proof.outputs,
         {**store.plain(settings.dataset), **run.source.box},
         settings.certification.level,
-        **arguments(settings.certification.corridor, certify_corridor),
+        identified_from=getattr(settings.vehicle, "contents", None),
+        **arguments(settings.certification.corridor, measure_corridor),
     )
-    if contents := getattr(settings.vehicle, "contents", None):
-        corridor["conditions"]["identified_from"] = contents
-    return corridor
 
 
 def ensure_certificate(run: Run) -> None:
@@ -241,8 +266,8 @@ def ensure_certificate(run: Run) -> None:
         # Trained in any case: this checks that the policy has these settings.
         _ = run.policy
         if (path := run.certificate_path).exists():
-            recorded = store.read_json(path).get("certification", {})
+            recorded = store.read_json(path).get("provenance", {}).get("settings")
             wanted = _recorded_certification(run.settings.certification)
-            if not store.differences(recorded, wanted):
+            if not store.differences(recorded or {}, wanted):
                 return
         certify_policy(run)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sfkd_jax import build, policy, store
+from sfkd_jax.certificate import write
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
@@ -190,7 +191,9 @@ def _certificate(trained: Policy, folder: Path, policy_sha256: str) -> str | Non
     if trained.certificate is None:
         return None
     path = folder / policy.CERTIFICATE
-    store.write_json(path, {**trained.certificate, "policy_sha256": policy_sha256})
+    provenance = replace(trained.certificate.provenance, policy_sha256=policy_sha256)
+    # A signature stays if this changes nothing.
+    write(path, replace(trained.certificate, provenance=provenance))
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -14,8 +14,12 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import build, store
+from sfkd_jax.certificate import Certificate, describe_signature
 from sfkd_jax.control import in_the_world
 from sfkd_jax.geometry import relative, shifted
+from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
+from sfkd_jax.policy._certificate import RECORDED as RECORDED
+from sfkd_jax.policy._certificate import read_certificate as read_certificate
 from sfkd_jax.policy._description import describe, interface_of
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
 from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
@@ -32,13 +36,6 @@ from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Key, Params
 
-CERTIFICATE = "certificate.json"
-"""The certificate in a run directory."""
-RECORDED = "certificate.runs.json"
-"""The certificate with the corridor of recorded runs; it is read in place of the other
-where both exist.
-"""
-
 
 @dataclass(frozen=True, eq=False)
 class Policy(TrainedModel):
@@ -46,14 +43,17 @@ class Policy(TrainedModel):
 
     Attributes:
         controller: `Controller(init, act)`, pure; jit, vmap or scan it.
-        certificate: the verified document of certificate.json, or None if it is
-            missing, refused or stale.
+        certificate: the verified certificate, or None if it is missing, refused or
+            stale.
+        signature: who signed the certificate, its measured numbers included: "unsigned"
+            or "signed by …".
         around: (planner=another along a path) -> controller, see
             `build.build_controller`.
     """
 
     controller: Controller
-    certificate: dict[str, Any] | None
+    certificate: Certificate | None
+    signature: str
     around: Callable[..., Controller]
 
     @property
@@ -63,11 +63,11 @@ class Policy(TrainedModel):
 
     def __repr__(self) -> str:
         """Say what it drives, where its certificate applies, and what is proved."""
-        return describe(self, self.certificate)
+        return describe(self, self.certificate, self.signature)
 
-    def _with_corridor(self) -> dict[str, Any]:
+    def _with_corridor(self) -> Certificate:
         """Return the certificate, or raise a ValueError if it has no corridor."""
-        if not (self.certificate and self.certificate.get("corridor")):
+        if self.certificate is None or self.certificate.corridor is None:
             raise ValueError(
                 "this policy has no certified corridor to keep a planner in: load one "
                 "in path coordinates with its certificate, as by "
@@ -146,6 +146,7 @@ def load(
     controller: Mapping[str, Any] | None = None,
     env_source: str = "measured",
     adaptive: bool = False,
+    signed_by: str | Path | None = None,
 ) -> Policy:
     """Return the policy in a run directory, with its certificate verified.
 
@@ -160,9 +161,13 @@ def load(
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
             errors of its inputs while driving, see `control.Adaptation`.
+        signed_by: public ed25519 key of who must have signed the certificate, as 64
+            hexadecimal digits or the path of a PEM file. Only a signature vouches for
+            measured numbers. None to accept an unsigned certificate, too.
 
     Raises:
-        ArtefactError: as `restore`, or a certificate that does not hold.
+        ArtefactError: as `restore`, or a certificate that does not hold, or one that
+            `signed_by` has not signed.
         ValueError: `controller` or `env_source` does not fit the policy, or an estimate
             is asked of a policy that is not in path coordinates.
     """
@@ -170,13 +175,13 @@ def load(
     trained = restore(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
     trained = replace(trained, params=fold(trained.model, trained.params, on_host))
-    certificate, reason = read_certificate(path, trained)
+    certificate, reason = read_certificate(path, trained, signed_by=signed_by)
     with store.as_artefact_error(file):
         reads_env = trained.settings["model"].get("environment", True)
         settings = _driving_settings(trained.settings, controller, env_source)
         shielded = settings["controller"].get("shield")
     # Never the same planner without its shield, unless the caller says so.
-    if shielded and not (certificate or {}).get("corridor"):
+    if shielded and (certificate is None or certificate.corridor is None):
         raise store.ArtefactError(
             f"{file}: controller.shield needs a certified corridor, and "
             f"{reason or 'the certificate has none'}; run certify, or load it with "
@@ -202,13 +207,17 @@ def load(
             adaptive=adaptive,
         )
         planner = around()
-    if certificate is None:
+    signature = "unsigned"
+    if certificate is not None:
+        signature = describe_signature(certificate.sha256, certificate.signature)
+    else:
         # 3: `policy_numerics` stands between this function and its caller.
         warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
     return Policy(
         **vars(replace(trained, settings=settings)),
         controller=_entrance(planner, trained),
         certificate=certificate,
+        signature=signature,
         around=around,
     )
 
@@ -296,34 +305,3 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
         return control, state, info
 
     return _in_policy_numerics(Controller(init, act))
-
-
-def read_certificate(
-    path: str | Path, trained: TrainedModel
-) -> tuple[dict[str, Any] | None, str]:
-    """Verify the certificate beside a policy, in its run directory.
-
-    Returns:
-        The certificate and "", or None and the reason why there is none.
-
-    Raises:
-        ArtefactError: it is damaged, or does not follow from its witnesses.
-    """
-    from sfkd_jax import certification  # loaded only if there is something to verify
-
-    files = [policy_file(path).with_name(name) for name in (RECORDED, CERTIFICATE)]
-    file = next((file for file in files if file.exists()), None)
-    if file is None:
-        return None, f"{CERTIFICATE} is missing"
-    document = store.read_json(file, keys=("valid",))
-    if document["valid"] is not True:
-        reason = store.one_line(document.get("reason"))
-        return None, f"the certificate was refused: {reason}"
-    try:
-        with store.as_artefact_error(file):
-            certification.verify_document(document, trained)
-    except certification.CertificateStale as reason:
-        return None, f"{reason}; certify again"
-    except certification.CertificationRefused as reason:
-        raise store.ArtefactError(f"{file}: {reason}") from None
-    return document, ""

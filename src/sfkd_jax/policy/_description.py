@@ -6,20 +6,21 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import build
+from sfkd_jax.certificate import Certificate, Conditions
 from sfkd_jax.plants import axes
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
 
 
 def interface_of(
-    trained: TrainedModel, certificate: dict[str, Any] | None
+    trained: TrainedModel, certificate: Certificate | None
 ) -> dict[str, Any]:
     """Return names, units and limits of controls, observation, e and reference."""
     vehicle = trained.vehicle
     environment = trained.settings["environment"]
     # An environment that was measured in logs has names of its own.
-    boxes = (certificate or {}).get("boxes", {})
-    columns = boxes.get("names", {}).get("env")
+    names = certificate.measured.boxes.names if certificate else None
+    columns = list(names.env) if names else None
     labels = [entry.label for entry in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
@@ -38,8 +39,16 @@ def interface_of(
     }
 
 
-def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
-    """Return what a policy drives, where its certificate applies, what is proved."""
+def describe(
+    trained: TrainedModel, certificate: Certificate | None, signature: str
+) -> str:
+    """Return what a policy drives, where its certificate applies, what is proved.
+
+    Args:
+        trained: the policy.
+        certificate: its verified certificate, or None.
+        signature: who signed the certificate, in words.
+    """
     vehicle = trained.vehicle
     interface = interface_of(trained, certificate)
     frame = "along a path" if trained.model.along_path else "in the world"
@@ -59,56 +68,60 @@ def describe(trained: TrainedModel, certificate: dict[str, Any] | None) -> str:
     ]
     if certificate:
         lines.append(_certified_box(certificate, trained))
-        lines.extend(_certified_facts(certificate, box["names"]))
+        lines.extend(_certified_facts(certificate, signature, box["names"]))
     else:
         lines.append("no certificate: nothing is proved, nothing measured")
     return "\n  ".join(lines)
 
 
-def _certified_box(document: dict[str, Any], trained: TrainedModel) -> str:
+def _certified_box(certificate: Certificate, trained: TrainedModel) -> str:
     """Return the line about the states for which the certificate is stated."""
-    boxes = document["boxes"]
-    low, high = boxes["state"]
+    boxes = certificate.measured.boxes
+    low, high = boxes.state
     named = axes(trained.vehicle, along_path=trained.model.along_path)
     if not trained.model.along_path:
         return f"certified box: {in_words(named['state'], low, high)}"
     names = [*named["state"], *named["control"][2:]]
     # The first two inputs are ν, which is the planner's choice and has no condition.
-    inputs_low, inputs_high = boxes["control"]
+    inputs_low, inputs_high = boxes.control
     limits_low = [*low, *inputs_low[2:]]
     limits_high = [*high, *inputs_high[2:]]
     return f"certified box: {in_words(names, limits_low, limits_high)}"
 
 
-def _certified_facts(document: dict[str, Any], env_names: list[str]) -> Iterator[str]:
+def _certified_facts(
+    certificate: Certificate, signature: str, env_names: list[str]
+) -> Iterator[str]:
     """Yield the lines about what is proved and what is only measured."""
-    yield f"proved: alpha {document['alpha']:.4f}, contraction of the model a step"
-    d_bar = document.get("d_bar") or {"value": float("nan")}
-    measured = f"measured, not signed: d_bar {d_bar['value']:.3g}"
-    corridor = document.get("corridor")
-    if not corridor:
+    alpha = certificate.proof.alpha
+    yield f"proved: alpha {alpha:.4f}, contraction of the model a step"
+    d_bar = certificate.measured.d_bar.one_step.latent
+    measured = f"measured, {signature}: d_bar {d_bar:.3g}"
+    corridor = certificate.corridor
+    if corridor is None:
         yield f"{measured}; no corridor"
         return
-    width = f"{corridor['corridor_m']:.3f} m to each side"
-    kept = f"{100 * corridor['coverage']:.1f} % of {corridor['coverage_runs']} runs"
+    width = f"{corridor.corridor_m:.3f} m to each side"
+    coverage = corridor.coverage
+    kept = f"{100 * coverage.share:.1f} % of {coverage.runs} runs"
     yield f"{measured}, corridor {width}, kept in {kept}"
-    yield _corridor_conditions(corridor["conditions"], env_names)
-    if recorded := document.get("recorded"):
-        number = recorded["conditions"]["runs"]
-        width = f"{recorded['corridor_m']:.3f} m"
-        yield f"of {number} runs of the car: {width} at level {recorded['level']:g}"
-    elif not build.is_claimed(document):
+    yield _corridor_conditions(corridor.conditions, env_names)
+    if recorded := corridor.recorded:
+        number = recorded.conditions.runs
+        width = f"{recorded.corridor_m:.3f} m"
+        yield f"of {number} runs of the car: {width} at level {recorded.level:g}"
+    elif not corridor.is_claimed:
         yield "of a model of logs, not of the car, about which nothing is claimed"
 
 
-def _corridor_conditions(conditions: dict[str, Any], env_names: list[str]) -> str:
+def _corridor_conditions(conditions: Conditions, env_names: list[str]) -> str:
     """Return the line about the runs on which the corridor was measured."""
-    slowest, fastest = conditions["speed"]
-    env_low, env_high = conditions["env_box"]
+    slowest, fastest = conditions.speed
+    env_low, env_high = conditions.env_box
     box = in_words(
         ["speed [m/s]", *env_names], [slowest, *env_low], [fastest, *env_high]
     )
-    shortest, longest = conditions["dwell_s"]
+    shortest, longest = conditions.dwell_s
     dwell = f"{shortest:g} to {longest:g} s"
-    bend = conditions["peak_curvature"]
+    bend = conditions.peak_curvature
     return f"under: {box}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"

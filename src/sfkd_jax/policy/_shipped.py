@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sfkd_jax import store
+from sfkd_jax.certificate import Certificate, read
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """A folder for each shipped policy, as `train` wrote it."""
@@ -50,16 +51,16 @@ def shipped_names() -> list[str]:
 
 def _summary(folder: Path) -> ShippedPolicy:
     """Read the summary of one policy from its certificate."""
-    document = store.read_json(folder / "certificate.json", keys=("boxes",))
-    env_low, env_high = document["boxes"]["env"]
-    corridor = document.get("corridor")
-    conditions = corridor["conditions"] if corridor else {}
+    certificate = read(folder / "certificate.json")
+    assert isinstance(certificate, Certificate)
+    env_low, env_high = certificate.measured.boxes.env
+    corridor = certificate.corridor
     return ShippedPolicy(
         vehicle=folder.name.split("_")[0],
         frame="path" if corridor else "body",
-        corridor_m=corridor["corridor_m"] if corridor else None,
-        speed=tuple(conditions["speed"]) if conditions else None,
-        peak_curvature=conditions.get("peak_curvature"),
+        corridor_m=corridor.corridor_m if corridor else None,
+        speed=corridor.conditions.speed if corridor else None,
+        peak_curvature=corridor.conditions.peak_curvature if corridor else None,
         env_low=tuple(round(end, 6) for end in env_low),
         env_high=tuple(round(end, 6) for end in env_high),
     )

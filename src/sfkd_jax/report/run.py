@@ -11,6 +11,7 @@ import pandas as pd
 
 from sfkd_jax import store
 from sfkd_jax.build import build_vehicle
+from sfkd_jax.certificate import signature_of
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
 from sfkd_jax.evaluation.metrics import Row
@@ -31,8 +32,7 @@ PROOF = (
     "Proved: recomputed from the stored weights, for every state, command and "
     "environment in the boxes. Measured: a quantile over runs that training never saw, "
     "promised for further runs under the same conditions. Unsigned: whoever can write "
-    "the file can change such a number within its range. Outside the boxes nothing is "
-    "claimed."
+    "the file can change such a number. Outside the boxes nothing is claimed."
 )
 
 
@@ -89,7 +89,7 @@ def certificate_document(run: Path, policy: dict[str, Any]) -> dict[str, Any]:
     """Return the certificate of a run; one about other weights is not valid."""
     certificate = read_optional(run / "certificate.json")
     weights = policy.get("sha256")
-    certified_weights = certificate.get("weights_sha256")
+    certified_weights = dig(certificate, "provenance", "weights_sha256")
     # Valid for other weights is not valid here: the page must not show it.
     if weights and certified_weights and weights != certified_weights:
         reason = "the certificate in this run is about other weights"
@@ -99,7 +99,7 @@ def certificate_document(run: Path, policy: dict[str, Any]) -> dict[str, Any]:
 
 def holds(certificate: dict[str, Any]) -> bool:
     """Return whether a certificate is valid, with a contraction factor below one."""
-    alpha: Any = certificate.get("alpha")
+    alpha: Any = dig(certificate, "proof", "alpha")
     return certificate.get("valid") is True and is_number(alpha) and alpha < 1
 
 
@@ -227,12 +227,13 @@ def _certified(record: dict[str, Any], policy: dict[str, Any]) -> list[Part]:
 def _certified_quantities(record: dict[str, Any]) -> dict[str, list[str]]:
     """Return name -> [value, what it rests on] of what a certificate holds."""
     file = resources.files("sfkd_jax.report") / "templates" / "certificate.csv"
+    signature = signature_of(record)
     quantities = {}
     for line in file.read_text("utf-8").splitlines():
         name, place, writer, basis = line.split(";")
         shown = _WRITERS[writer](dig(record, *place.split(".")))
         if DASH not in shown:
-            quantities[name] = [shown, basis]
+            quantities[name] = [shown, basis.format(signature=signature)]
     return quantities
 
 
@@ -243,9 +244,10 @@ def _certified_boxes(
     boxes = {}
     for box, known in _axes(record, policy).items():
         # Boxes of logged data name their own axes.
-        names = dig(record, "boxes", "names", box) or known
+        names = dig(record, "measured", "boxes", "names", box) or known
         for axis, name in enumerate(names):
-            ends = [dig(record, "boxes", box, end, str(axis)) for end in ("0", "1")]
+            place = ("measured", "boxes", box)
+            ends = [dig(record, *place, end, str(axis)) for end in ("0", "1")]
             if is_pair(ends):
                 boxes[f"{box}: {name}"] = ends
     return boxes
@@ -270,7 +272,7 @@ def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]
     errors = read_optional(run_dir / "open_loop.json")
     if not errors.get("steps"):
         return []
-    radii = dig(proof, "tube", "physical", "position_m")
+    radii = dig(proof, "measured", "tube", "physical", "position_m")
     path = style.save(images / "open_loop.png", figures.open_loop, errors, radii or [])
     number = plain(errors.get("trajectories"))
     return [

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,9 +101,13 @@ class InnovationTest(NamedTuple):
         return jnp.where(jnp.isnan(innovation), means, moved)
 
 
-def innovation_test(document: Mapping[str, Any]) -> InnovationTest:
-    """Return the test from its entry of a certificate."""
-    entries = [np.asarray(document[name], float) for name in InnovationTest._fields]
+def innovation_test(
+    levels: Sequence[float],
+    deviation: Sequence[Sequence[float]],
+    threshold: Sequence[Sequence[float]],
+) -> InnovationTest:
+    """Return the test of a certificate, on the device; see `InnovationTest`."""
+    entries = [np.asarray(entry, float) for entry in (levels, deviation, threshold)]
     return InnovationTest(*jax.device_put(entries))
 
 
