@@ -18,7 +18,6 @@ from jaxtyping import Array
 
 from sfkd_jax import build, policy, store
 from sfkd_jax.certificate import write
-from sfkd_jax.info import ControllerInfo
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
 from sfkd_jax.policy import Policy
@@ -215,7 +214,12 @@ def flat_programs(
         trained: the policy.
         ahead: what its controller takes after e, by name; None for a reference.
     """
-    init, act = trained.controller
+    init = trained.controller.init
+
+    def act(*inputs: Any) -> tuple[Any, Any, dict[str, Any]]:
+        control, after, info = trained.controller.act(*inputs)
+        return control, after, {"healthy": info.healthy, **info._asdict()}
+
     key, state, *measured = _example_inputs(trained)
     names = ["observation", "env", "reference"]
     if ahead is not None:
@@ -240,7 +244,7 @@ def flat_programs(
         params = jax.lax.optimization_barrier(trained.params)
         before = jax.tree.unflatten(structure, state_leaves)
         control, after, info = act(params, before, *measurements)
-        return control, *_unpack(after), *jax.tree.leaves(_reported(info))
+        return control, *_unpack(after), *jax.tree.leaves(info)
 
     control, after, info = jax.eval_shape(act, trained.params, state, *measured)
     states = _named("state", state)
@@ -251,16 +255,11 @@ def flat_programs(
             "shapes or dtypes"
         )
     inputs = (*states, *map(_leaf, names, measured))
-    outputs = (_leaf("control", control), *states, *_named("info", _reported(info)))
+    outputs = (_leaf("control", control), *states, *_named("info", info))
     return {
         "init": Program(flat_init, (_leaf("key", key),), states),
         "act": Program(flat_act, inputs, outputs),
     }
-
-
-def _reported(info: ControllerInfo) -> dict[str, Any]:
-    """Return the parts of an `info` by name, with what follows from them."""
-    return {"healthy": info.healthy, **info._asdict()}
 
 
 def in_window(
