@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.certification.corridor import (
     calibrate_on_runs,
     check_count,
@@ -37,7 +37,7 @@ def main(run: Run) -> dict[str, Any]:
     check_count(count, level, "runs")
     loop = closed_loop(trained.vehicle, trained.model, trained.params, trained.law, ())
     scores, lateral = scores_of_runs(loop, document, runs)
-    coverage = corridor_coverage(build.corridor_of(document)["bounds"], scores)
+    coverage = corridor_coverage(assembly.corridor_of(document)["bounds"], scores)
     store.print_message(
         f"{count} runs, cut to the shortest, {seconds:g} s: "
         f"{1e3 * np.sqrt(np.mean(lateral**2)):.1f} mm (RMS) from the path, "

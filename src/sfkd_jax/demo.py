@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.experiment import evaluating, run_directory
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
@@ -32,10 +32,10 @@ def main(run: Run) -> dict[str, Any]:
     run = Run(settings, run.source)
     episodes = evaluating.make_episodes(run)
     home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
-    references = build.reference_systems(run.plant, trained.law)
+    references = assembly.reference_systems(run.plant, trained.law)
     certificate = trained.certificate or {}
     systems = {
-        trained.settings["model"]["system"]: build.System(
+        trained.settings["model"]["system"]: assembly.System(
             trained.model,
             trained.params,
             settings.environment.source,

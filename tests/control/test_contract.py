@@ -23,7 +23,7 @@ from helpers import (
 )
 from jaxtyping import jaxtyped
 
-from sfkd_jax import build, control, models, plants
+from sfkd_jax import assembly, control, models, plants
 from sfkd_jax.rollout import fold, with_offset
 from sfkd_jax.types import ControllerInfo
 
@@ -65,7 +65,7 @@ def mppi(law, **settings):
 
 def registered(name):
     """A planner as it is registered, with small settings and slew limits."""
-    known = signature(build.PLANNERS[name]).parameters
+    known = signature(assembly.PLANNERS[name]).parameters
     # One that takes no task solves a quadratic program of its own.
     samples = "task" in known
     settings = {
@@ -78,7 +78,7 @@ def registered(name):
         settings |= {"sampling": "feedback"}
         settings["task"] |= {"control_rate": (0.5, 20.0)}
     model, params = model_and_params("nominal" if samples else "koopman_mpc")
-    return build.build_controller(settings, model, PLANT, **BOX), params
+    return assembly.build_controller(settings, model, PLANT, **BOX), params
 
 
 def around_law(model, law):
@@ -156,7 +156,7 @@ def constrained():
 
 
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
-PLANNERS = {name: partial(registered, name) for name in build.PLANNERS}
+PLANNERS = {name: partial(registered, name) for name in assembly.PLANNERS}
 VARIANTS = {
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_knots": partial(
@@ -175,7 +175,7 @@ WRAPPERS = {
 }
 BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within
-`LIMITS`. A planner that is registered in `build.PLANNERS` is among them.
+`LIMITS`. A planner that is registered in `assembly.PLANNERS` is among them.
 """
 DETERMINISTIC = ("gradient", "koopman_mpc")
 """Those whose plan does not depend on the key."""

@@ -10,7 +10,7 @@ import pytest
 from helpers import any_law, jit, tiny
 
 import sfkd_jax
-from sfkd_jax import build, control, scenarios
+from sfkd_jax import assembly, control, scenarios
 from sfkd_jax.control import Conditions, along_reference, safety_filter
 from sfkd_jax.geometry import path_state, vehicle_state
 from sfkd_jax.plants import kinematic
@@ -431,7 +431,7 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     record = lambda **options: made.update(options) or shield(**options)
     monkeypatch.setattr(control, "Shield", record)
     certificate = {"corridor": corridor, "boxes": boxes, "alpha": 0.9}
-    build_with = partial(build.in_corridor, scripted(), TOY, kinematic(), LAW)
+    build_with = partial(assembly.in_corridor, scripted(), TOY, kinematic(), LAW)
     build_with(certificate)
     low, high = made["conditions"].state
     # Other coordinates have the box of the data and a quarter of its width.

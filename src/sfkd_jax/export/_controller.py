@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
 from sfkd_jax.policy import Policy
@@ -314,7 +314,7 @@ def _example_inputs(trained: Policy) -> tuple[Any, ...]:
     key = jax.eval_shape(partial(jax.random.key, 0))
     state = jax.eval_shape(trained.controller.init, key)
     settings = trained.settings
-    horizon = build.controller_horizon(settings["controller"])
+    horizon = assembly.controller_horizon(settings["controller"])
     return (
         key,
         state,

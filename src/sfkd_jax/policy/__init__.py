@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import build, store
+from sfkd_jax import assembly, store
 from sfkd_jax.control import behind, requesting
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.policy._description import describe, interface_of
@@ -49,7 +49,7 @@ class Policy(TrainedModel):
         certificate: the verified document of certificate.json, or None if it is
             missing, refused or stale.
         around: (planner=another along a path) -> controller, see
-            `build.build_controller`.
+            `assembly.build_controller`.
     """
 
     controller: Controller
@@ -93,7 +93,7 @@ class Policy(TrainedModel):
         with jax.ensure_compile_time_eval():
             if along_path:
                 return _entrance(self.around(planner=planner), self)
-            horizon = build.controller_horizon(self.settings["controller"])
+            horizon = assembly.controller_horizon(self.settings["controller"])
             coordinates = len(self.vehicle.state_names) - 1
             shielded = self.around(planner=requesting(planner, horizon, coordinates))
         return _entrance(behind(shielded), self)
@@ -120,7 +120,7 @@ class Policy(TrainedModel):
         names = self.interface["environment"]["names"]
         friction = [i for i, name in enumerate(names) if name.startswith("friction")]
         with jax.ensure_compile_time_eval():
-            controller = build.build_in_lane(
+            controller = assembly.build_in_lane(
                 self.controller,
                 self.vehicle,
                 law,
@@ -158,7 +158,7 @@ def load(
         path: path of the directory or of a policy.safetensors, or the name of a policy
             that ships, see `policies`.
         controller: settings of a controller to build instead of the saved one.
-        env_source: one of `build.ENV_SOURCES`. "estimated" for a policy in path
+        env_source: one of `assembly.ENV_SOURCES`. "estimated" for a policy in path
             coordinates that estimates the environment and ignores the one it is given;
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
@@ -193,7 +193,7 @@ def load(
         errors = store.as_artefact_error(file, ValueError)
     with errors:
         around = partial(
-            build.build_controller,
+            assembly.build_controller,
             settings["controller"],
             trained.model,
             trained.vehicle,
@@ -224,7 +224,7 @@ def _driving_settings(
     Args:
         saved: the settings in the file of the policy.
         controller: settings of a controller in place of the saved one, or None.
-        env_source: one of `build.ENV_SOURCES`.
+        env_source: one of `assembly.ENV_SOURCES`.
     """
     return {
         **saved,
@@ -239,7 +239,7 @@ def _check_env_source(env_source: str, reads_env: bool) -> None:
     What a model reads must come from somewhere; what it does not is not estimated.
     """
     impossible = "none" if reads_env else "estimated"
-    sources = [source for source in build.ENV_SOURCES if source != impossible]
+    sources = [source for source in assembly.ENV_SOURCES if source != impossible]
     if env_source not in sources:
         raise ValueError(
             f"env_source must be {' or '.join(sources)} for a policy that "

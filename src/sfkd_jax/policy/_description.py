@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from sfkd_jax import build
+from sfkd_jax import assembly
 from sfkd_jax.plants import axes
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
@@ -23,7 +23,7 @@ def interface_of(
     labels = [entry.label for entry in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
-        "horizon": build.controller_horizon(trained.settings["controller"]),
+        "horizon": assembly.controller_horizon(trained.settings["controller"]),
         "controls": [
             {"name": control.label, "low": control.low, "high": control.high}
             for control in vehicle.controls
@@ -97,7 +97,7 @@ def _certified_facts(document: dict[str, Any], env_names: list[str]) -> Iterator
         number = recorded["conditions"]["runs"]
         width = f"{recorded['corridor_m']:.3f} m"
         yield f"of {number} runs of the car: {width} at level {recorded['level']:g}"
-    elif not build.is_claimed(document):
+    elif not assembly.is_claimed(document):
         yield "of a model of logs, not of the car, about which nothing is claimed"
 
 

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfkd_jax import control, plants
-from sfkd_jax.build._controller_settings import (
+from sfkd_jax.assembly._controller_settings import (
     PLANNERS,
     ControllerSettings,
     SearchSettings,
 )
-from sfkd_jax.build._corridor import Corner, conditions_of, corridor_of, in_corridor
+from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
 from sfkd_jax.geometry import CURVATURE, HEADING, PATH_SPEED, REFERENCE_SPEED
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
