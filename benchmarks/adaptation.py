@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import arguments, stamp, write
 from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
-from sfkd_jax import build, plants, policy
+from sfkd_jax import assembly, plants, policy
 from sfkd_jax.evaluation.metrics import room_in_lane
 from sfkd_jax.plants import equivalent_wind
 from sfkd_jax.scenarios import random_side_forces
@@ -91,7 +91,7 @@ def planner(loaded, model, *, bounded=True, adaptive=False, source="measured"):
     """The policy's own planner with another model, without a shield."""
     settings = dict(loaded.settings["controller"], shield=False)
     ends = loaded.settings["environment"] if bounded else {}
-    return build.build_controller(
+    return assembly.build_controller(
         settings,
         model,
         loaded.vehicle,
@@ -107,8 +107,8 @@ def systems(loaded, case, car):
     model = loaded.model
     params = loaded.params
     # Systems that know a car have its own step as their model.
-    knowing = build.reference_systems(car, loaded.law)["oracle"].model
-    unknowing = build.reference_systems(loaded.vehicle, loaded.law)["oracle"].model
+    knowing = assembly.reference_systems(car, loaded.law)["oracle"].model
+    unknowing = assembly.reference_systems(loaded.vehicle, loaded.law)["oracle"].model
     source = "estimated" if case.estimate_env else "measured"
     adapting = partial(planner, loaded, adaptive=True, source=source)
     rows = {

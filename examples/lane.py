@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 import sfkd_jax
-from sfkd_jax import build, evaluation, scenarios
+from sfkd_jax import assembly, evaluation, scenarios
 from sfkd_jax.report import film as films
 
 SECONDS = 60.0
@@ -103,7 +103,7 @@ def main(runs=1, seed=0, vehicle="dynamic", film="lane.gif"):
     """Drive random courses, write the film, and return the summary of the courses."""
     policy = sfkd_jax.load(f"{vehicle}_path")
     plant = policy.vehicle
-    draw_scene = jax.jit(build.build_scenario(ROAD, plant, duration=SECONDS))
+    draw_scene = jax.jit(assembly.build_scenario(ROAD, plant, duration=SECONDS))
     drive = compile_drive(policy)
 
     keys = jax.random.split(jax.random.key(seed), runs)

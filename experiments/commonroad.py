@@ -18,7 +18,7 @@ import numpy as np
 import sfkd_jax
 from benchmarks import arguments, stamp, write
 from benchmarks.device import SETTLED, SHIPPED, driving, family, rmse_mm
-from sfkd_jax import adapters, build, policy
+from sfkd_jax import adapters, assembly, policy
 
 POLICY = "dynamic_path"
 FRICTIONS = (0.9, 0.6, 0.3)
@@ -32,10 +32,12 @@ def drivers():
     plant = trained.vehicle
     settings = dict(trained.settings["controller"], shield=False)
     box = trained.settings["environment"]
-    along_path = partial(build.build_controller, settings, plant=plant, law=trained.law)
-    bicycle = build.reference_systems(plant)["nominal"]
-    bicycle_along_path = build.reference_systems(plant, trained.law)["nominal"]
-    in_world = build.build_controller(
+    along_path = partial(
+        assembly.build_controller, settings, plant=plant, law=trained.law
+    )
+    bicycle = assembly.reference_systems(plant)["nominal"]
+    bicycle_along_path = assembly.reference_systems(plant, trained.law)["nominal"]
+    in_world = assembly.build_controller(
         in_body_frame.settings["controller"], bicycle.model, plant
     )
     ours = along_path(trained.model, env_low=box["low"], env_high=box["high"])

@@ -66,7 +66,7 @@ THIRD_PARTY = {
     "evaluation": {"numpy", "scipy"},
     "report": {"numpy", "pandas", "matplotlib", "PIL", "jinja2"},
     "policy": {"numpy"},
-    "build": {"numpy"},
+    "assembly": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},
     "experiment": COMMAND_LINE | {"threadpoolctl", "yaml"},

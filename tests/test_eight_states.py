@@ -49,14 +49,14 @@ def electric(*, dt: float = 0.1) -> plants.Vehicle:
 @pytest.fixture
 def registered(monkeypatch):
     """The entry of `plants.FACTORIES`, and what is made of it on import."""
-    monkeypatch.setitem(build.PLANTS, "electric", electric)
-    own = schema("Vehicle", build.VehicleSettings, electric)
-    monkeypatch.setitem(build.VEHICLES, "electric", own)
+    monkeypatch.setitem(assembly.PLANTS, "electric", electric)
+    own = schema("Vehicle", assembly.VehicleSettings, electric)
+    monkeypatch.setitem(assembly.VEHICLES, "electric", own)
     return {"name": "electric"}
 
 
 def test_it_is_simulated_through_the_sensor_that_it_states(registered):
-    plant = build.build_vehicle(registered)
+    plant = assembly.build_vehicle(registered)
     follow = driver(plant)
     seen = {"charge": lambda info: info.planner}
 
@@ -64,7 +64,7 @@ def test_it_is_simulated_through_the_sensor_that_it_states(registered):
         info = ControllerInfo(planner=observation[7])
         return follow(observation, reference), memory, info
 
-    scenario = build.build_scenario({"name": "s1"}, plant, duration=3.0)
+    scenario = assembly.build_scenario({"name": "s1"}, plant, duration=3.0)
     episode = evaluation.simulate(
         plant.step,
         Controller(lambda key: (), act),
@@ -89,7 +89,7 @@ def test_its_data_have_eight_states_and_its_loop_seven_coordinates():
         partial(data.generate, plant, driver(plant), **few), jax.random.key(0)
     )
     assert in_world.states.shape == (8, 6, 8)
-    loop = build.build_loop(plant, LAW)
+    loop = assembly.build_loop(plant, LAW)
     assert loop.state_names[3:] == (
         "e_y", "e_psi", "v", "v_y", "yaw_rate", "steering", "charge",
     )  # fmt: skip
@@ -131,7 +131,7 @@ def test_the_page_of_a_run_names_its_axes(registered, tmp_path):
 
 def built(plant, **adaptation):
     """A controller along a path with adaptation, of a model that knows the car."""
-    model = models.physics(build.build_loop(plant, LAW).step, along_path=True)
+    model = models.physics(assembly.build_loop(plant, LAW).step, along_path=True)
     options = {
         "name": "mppi",
         "planner": "mppi",
@@ -139,7 +139,9 @@ def built(plant, **adaptation):
         "mppi": {"num_samples": 4, "horizon": 3, "noise_std": [0.01, 0.3]},
         "adaptation": adaptation,
     }
-    return build.build_controller(options, model, plant, law=LAW, adaptive=True, **BOX)
+    return assembly.build_controller(
+        options, model, plant, law=LAW, adaptive=True, **BOX
+    )
 
 
 def test_adaptation_refuses_what_nobody_knows_of_it_and_works_when_told():

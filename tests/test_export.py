@@ -23,7 +23,7 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 
 import sfkd_jax
-from sfkd_jax import build, certification, policy, store
+from sfkd_jax import assembly, certification, policy, store
 from sfkd_jax import export as exporting
 from sfkd_jax.certificate import Boxes, Certificate, Provenance, Refusal, read, write
 from sfkd_jax.export import __main__ as export
@@ -57,7 +57,7 @@ def exported(tmp_path_factory):
     """A certified run with weights as they were drawn; what the command wrote and printed."""
     requested = run(tmp_path_factory.mktemp("export") / "runs")
     chosen = requested.settings
-    params = jit(build.build_model(chosen.model, space(), requested.plant).init)(
+    params = jit(assembly.build_model(chosen.model, space(), requested.plant).init)(
         jax.random.key(0)
     )
     stored = store.plain(vars(chosen) | {"space": space()._asdict()})

@@ -9,7 +9,7 @@ import pytest
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import build, models
+from sfkd_jax import assembly, models
 from sfkd_jax.store import ArtefactError
 from sfkd_jax.types import Space
 
@@ -108,9 +108,9 @@ def test_a_factory_that_makes_no_model_is_one_line(
 def test_a_stored_model_cannot_name_a_function_of_python(factory):
     """These modules are imported in every process, so that alone is no consent."""
     with pytest.raises(ValueError, match="Python's own"):
-        build.check_imported({"model": {"factory": factory}})
+        assembly.check_imported({"model": {"factory": factory}})
 
 
 @pytest.mark.parametrize("settings", [None, [], {}, {"model": None}, {"model": {}}])
 def test_settings_without_a_factory_name_no_code(settings):
-    build.check_imported(settings)
+    assembly.check_imported(settings)

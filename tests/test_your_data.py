@@ -181,7 +181,7 @@ def test_a_model_of_its_logs_takes_the_place_of_a_car(driven, monkeypatch, capsy
     monkeypatch.setattr(identified, "REGRESSION_STEPS", 400)
     chosen = logged(driven, "vehicle.missing=drop")
     assert "wind is nan, 0.33 % of the rows, dropped" in capsys.readouterr().err
-    plant = build.build_vehicle(chosen.vehicle)
+    plant = assembly.build_vehicle(chosen.vehicle)
     (low, calm), (high, windy) = chosen.environment.box.values()
     assert 0.4 <= low < high <= 0.9
     assert -5.0 <= calm < windy <= 5.0

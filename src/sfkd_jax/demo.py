@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.experiment import evaluating, run_directory
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
@@ -35,7 +35,7 @@ def main(run: Run) -> dict[str, Any]:
     references = build.reference_systems(run.plant, trained.law)
     corridor = trained.certificate.corridor if trained.certificate else None
     systems = {
-        trained.settings["model"]["system"]: build.System(
+        trained.settings["model"]["system"]: assembly.System(
             trained.model,
             trained.params,
             settings.environment.source,

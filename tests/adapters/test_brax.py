@@ -64,7 +64,7 @@ def test_a_controller_drives_it_as_the_test_track_has_it_driven():
     """The controls of a simulated episode, as actions: the same motion, and the same
     questions to the controller.
     """
-    plant, law = plants.kinematic(), build.build_driver(plants.kinematic())
+    plant, law = plants.kinematic(), assembly.build_driver(plants.kinematic())
 
     def act(params, state, observation, env, reference):
         return law(observation, reference), state, ControllerInfo()
@@ -216,7 +216,9 @@ def test_under_brax_wrappers_episodes_end_in_time_and_begin_again():
 )
 def test_bad_settings_are_refused_in_one_line(settings, message):
     if settings.get("scenario") == "family":
-        family = build.build_scenario({"name": "s1"}, plants.kinematic(), duration=2.0)
+        family = assembly.build_scenario(
+            {"name": "s1"}, plants.kinematic(), duration=2.0
+        )
         settings = settings | {"scenario": family}
     with pytest.raises(ValueError, match=message) as refusal:
         envs.get_environment("sfkd_vehicle", **settings)
@@ -225,7 +227,7 @@ def test_bad_settings_are_refused_in_one_line(settings, message):
 
 def test_a_plant_and_a_family_of_ones_own():
     plant = plants.with_speed_loop(plants.dynamic(dt=0.05))
-    family = build.build_scenario({"name": "s1"}, plant, duration=1.0)
+    family = assembly.build_scenario({"name": "s1"}, plant, duration=1.0)
     task = adapters.BraxVehicle(vehicle=plant, scenario=family).task
     assert (task.plant.dt, task.observation_size) == (0.05, 50)
     control = jnp.asarray([0.1, 12.0])

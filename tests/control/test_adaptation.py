@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
 
-from sfkd_jax import build, certification, control, models, plants
+from sfkd_jax import assembly, certification, control, models, plants
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.control.wrappers import _estimator as estimator
 from sfkd_jax.control.wrappers._adaptation import _compensation
@@ -18,7 +18,7 @@ from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
 PLANT, LAW = plants.kinematic(), any_law()
-MODEL = models.physics(build.build_loop(PLANT, LAW).step, along_path=True)
+MODEL = models.physics(assembly.build_loop(PLANT, LAW).step, along_path=True)
 """The true loop as a model, so that every estimate has an exact answer."""
 LOOP = estimator.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))
 NOISE = np.float32([0.015, 0.002, 0.03])

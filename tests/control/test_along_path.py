@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
-from sfkd_jax import build, control, plants
+from sfkd_jax import assembly, control, plants
 from sfkd_jax.geometry import curvature_ahead, path_coordinates
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
@@ -33,7 +33,7 @@ def bend(slope=1e-4):
 @cache
 def planner(samples, **options):
     """A planner around the law, as a controller in the world, and its step."""
-    model = build.reference_systems(PLANT, LAW)["oracle"].model
+    model = assembly.reference_systems(PLANT, LAW)["oracle"].model
     task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
     along = control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
     controller = control.along_reference(along, coordinates=3)

@@ -76,7 +76,7 @@ def mppi(law, **settings):
 
 def registered(name):
     """A planner as it is registered, with small settings and slew limits."""
-    known = signature(build.PLANNERS[name]).parameters
+    known = signature(assembly.PLANNERS[name]).parameters
     # One that takes no task solves a quadratic program of its own.
     samples = "task" in known
     settings = {
@@ -89,7 +89,7 @@ def registered(name):
         settings |= {"sampling": "feedback"}
         settings["task"] |= {"control_rate": (0.5, 20.0)}
     model, params = model_and_params("nominal" if samples else "koopman_mpc")
-    return build.build_controller(settings, model, PLANT, **BOX), params
+    return assembly.build_controller(settings, model, PLANT, **BOX), params
 
 
 def around_law(model, law):
@@ -167,7 +167,7 @@ def constrained():
 
 
 FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
-PLANNERS = {name: partial(registered, name) for name in build.PLANNERS}
+PLANNERS = {name: partial(registered, name) for name in assembly.PLANNERS}
 VARIANTS = {
     "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_knots": partial(
@@ -186,7 +186,7 @@ WRAPPERS = {
 }
 BUILDERS = PLANNERS | VARIANTS | WRAPPERS
 """Name -> () -> (controller, params), for `HORIZON` steps of the kinematic plant within
-`LIMITS`. A planner that is registered in `build.PLANNERS` is among them.
+`LIMITS`. A planner that is registered in `assembly.PLANNERS` is among them.
 """
 DETERMINISTIC = ("gradient", "koopman_mpc")
 """Those whose plan does not depend on the key."""

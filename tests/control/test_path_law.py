@@ -10,7 +10,7 @@ import pytest
 from composing import settings
 from helpers import jit
 
-from sfkd_jax import build, plants, policy
+from sfkd_jax import assembly, plants, policy
 from sfkd_jax.control import TEXTBOOK, derive_path_law, textbook_law
 from sfkd_jax.experiment import identified, laws
 from sfkd_jax.geometry import path_state, path_step
@@ -163,7 +163,7 @@ LEARNED = (
 
 def derive_law(chosen):
     """The law of the settings, which no file holds."""
-    plant = build.build_vehicle(chosen.vehicle)
+    plant = assembly.build_vehicle(chosen.vehicle)
     return laws.derive_law(plant, chosen.dataset, chosen.environment.box)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sfkd_jax.build import CONTROLLER_SETTINGS
+from sfkd_jax.assembly import CONTROLLER_SETTINGS
 from sfkd_jax.experiment import option_files
 
 FILES = option_files.files()

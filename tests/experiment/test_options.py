@@ -9,7 +9,7 @@ from helpers import any_law, space
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import build, models, plants
+from sfkd_jax import assembly, models, plants
 from sfkd_jax.experiment import command, evaluating
 
 CONF = Path(command.conf_path())
@@ -40,7 +40,7 @@ def test_every_model_builds_and_names_its_system(option):
     own = ("model.factory=sfkd_jax.models:neural_ode",) if option == "own" else ()
     chosen = settings(f"model={option}", *own).model
     assert chosen.system == option.removesuffix("_tiny")
-    build.build_model(chosen, space(), plants.kinematic())
+    assembly.build_model(chosen, space(), plants.kinematic())
 
 
 @pytest.mark.parametrize(
@@ -51,13 +51,13 @@ def test_every_model_builds_and_names_its_system(option):
 def test_every_controller_builds_on_every_vehicle(vehicle, controller):
     given = GIVEN.get(vehicle, ())
     chosen = settings(f"vehicle={vehicle}", f"controller={controller}", *given)
-    plant = build.build_vehicle(chosen.vehicle)
+    plant = assembly.build_vehicle(chosen.vehicle)
     along = chosen.controller.sampling == "law"
     law = any_law(len(plant.state_names) - 1) if along else None
-    model = build.reference_systems(plant, law)["oracle"].model
+    model = assembly.reference_systems(plant, law)["oracle"].model
     if chosen.controller.planner == "koopman_mpc":  # it needs a linear predictor
         model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
-    controller = build.build_controller(chosen.controller, model, plant, law=law)
+    controller = assembly.build_controller(chosen.controller, model, plant, law=law)
     state = jax.eval_shape(controller.init, jax.random.key(0))
     # It starts with a plan of two seconds for steering and acceleration.
     assert (20, 2) in [leaf.shape for leaf in jax.tree.leaves(state)]
@@ -65,7 +65,7 @@ def test_every_controller_builds_on_every_vehicle(vehicle, controller):
 
 def test_every_learned_model_and_every_planner_has_an_option_file():
     assert set(models.FACTORIES) <= set(of("model"))
-    assert set(build.PLANNERS) <= set(of("controller"))
+    assert set(assembly.PLANNERS) <= set(of("controller"))
 
 
 @pytest.mark.parametrize(
@@ -118,6 +118,6 @@ def test_a_planner_without_its_settings_is_refused():
 
 def test_only_a_system_with_a_corridor_drives_round_obstacles():
     chosen = run("+experiment=s3_body", "scenario=obstacles")
-    system = build.reference_systems(chosen.plant)["oracle"]
+    system = assembly.reference_systems(chosen.plant)["oracle"]
     with pytest.raises(ValueError, match=r"certified corridor, and oracle has none"):
         evaluating.SystemEvaluation(chosen, "oracle", system)

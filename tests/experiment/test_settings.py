@@ -6,7 +6,7 @@ import pytest
 from composing import plain_settings, settings
 from helpers import put
 
-from sfkd_jax import build
+from sfkd_jax import assembly
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.options import parse_settings
 from sfkd_jax.experiment.run import Run
@@ -15,8 +15,8 @@ from sfkd_jax.settings import arguments, parse, replace, schema
 from sfkd_jax.store import plain
 
 OPTIONS = (
-    *(f"model={name}" for name in build.MODELS if name != "own"),
-    *(f"controller={name}" for name in build.PLANNERS),
+    *(f"model={name}" for name in assembly.MODELS if name != "own"),
+    *(f"controller={name}" for name in assembly.PLANNERS),
     "vehicle=dynamic",
     "dataset=path",
 )
@@ -70,7 +70,7 @@ def use(name, value):
     """What `train` does before anything is made."""
     chosen = parse_settings(put(plain_settings(), name, value))
     run = Run.of(chosen)
-    build.build_scenario(chosen.scenario, run.plant, duration=10.0)
+    assembly.build_scenario(chosen.scenario, run.plant, duration=10.0)
     stages.check_settings(run)
 
 

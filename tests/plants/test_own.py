@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import build, evaluation, plants
+from sfkd_jax import assembly, evaluation, plants
 
 NAMES = ("p_x", "p_y", "yaw", "v", "yaw_rate")
 LIMITS = {"control_low": (-1.0, -2.0), "control_high": (1.0, 2.0)}
@@ -22,7 +22,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)
-    plant = build.build_vehicle(SETTINGS | {"step": "own_vehicle:step"})
+    plant = assembly.build_vehicle(SETTINGS | {"step": "own_vehicle:step"})
     plants.check_step(plant)
     from own_vehicle import step
 
@@ -49,7 +49,7 @@ def test_a_missing_step_is_reported_when_it_is_needed_and_not_before(
     monkeypatch, step, message
 ):
     monkeypatch.syspath_prepend(EXAMPLES)
-    plant = build.build_vehicle(SETTINGS | {"step": step})
+    plant = assembly.build_vehicle(SETTINGS | {"step": step})
     with pytest.raises(ValueError, match=r"vehicle\.step") as caught:
         plants.check_step(plant)
     assert message in str(caught.value)

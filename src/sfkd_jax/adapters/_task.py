@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax import build
+from sfkd_jax import assembly
 from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
@@ -128,7 +128,7 @@ class DrivingTask:
         """The simulated car."""
         if isinstance(self.vehicle, Vehicle):
             return self.vehicle
-        return build.build_vehicle(
+        return assembly.build_vehicle(
             {"name": self.vehicle, "inner_loop": self.inner_loop, "speed_gain": 1.0}
         )
 
@@ -141,7 +141,7 @@ class DrivingTask:
         if self.scenario == "obstacles":
             options["peak_curvature"] = 0.004
             options["wavelengths"] = (100.0, 300.0)
-        return build.build_scenario(options, self.plant, duration=self.duration)
+        return assembly.build_scenario(options, self.plant, duration=self.duration)
 
     @property
     def action_size(self) -> int:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import build, store
+from sfkd_jax import assembly, store
 from sfkd_jax.data import (
     SCENARIOS,
     Dataset,
@@ -57,7 +57,7 @@ def drive(
             generate_along_path, plant, **{**along.options, **changes, **box}
         )
     options = {**arguments(settings, generate), **changes, **box}
-    return partial(generate, plant, build.build_driver(plant), **options)
+    return partial(generate, plant, assembly.build_driver(plant), **options)
 
 
 def simulate(

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sfkd_jax import build, evaluation, policy, store
-from sfkd_jax.build import ScenarioSettings, System
+from sfkd_jax import assembly, evaluation, policy, store
+from sfkd_jax.assembly import ScenarioSettings, System
 from sfkd_jax.evaluation.metrics import Row
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.options import Settings
@@ -59,7 +59,7 @@ def make_episodes(run: Run) -> EpisodeSet:
     plant = run.plant
     protocol = settings.evaluation
     run.source.check_plant()
-    family = build.build_scenario(
+    family = assembly.build_scenario(
         settings.scenario, plant, duration=protocol.episode_s, **run.source.box
     )
     sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
@@ -132,7 +132,7 @@ def load_systems(run: Run) -> dict[str, System]:
     `environment.source=estimated` every system that reads e estimates it.
     """
     settings = run.settings
-    references = build.reference_systems(run.plant, run.law)
+    references = assembly.reference_systems(run.plant, run.law)
     systems = {}
     for name in settings.evaluation.systems:
         if name == "oracle" and run.source.has_simulator:
@@ -141,9 +141,9 @@ def load_systems(run: Run) -> dict[str, System]:
         if name == "self":
             systems[settings.model.system] = _policy_system(run)
             continue
-        if run.source.along_path and name in build.LAWS_ALONE:
-            source = run.source.with_law_of(build.LAWS_ALONE[name])
-            alone = build.reference_systems(run.plant, source.law)
+        if run.source.along_path and name in assembly.LAWS_ALONE:
+            source = run.source.with_law_of(assembly.LAWS_ALONE[name])
+            alone = assembly.reference_systems(run.plant, source.law)
             references[name] = alone["law"]
         system = choose(references, name, "evaluation.systems entry")
         if settings.environment.source == "estimated" and system.env_source != "none":
@@ -178,7 +178,7 @@ class SystemEvaluation:
             # The settings of logs state no box of e: it is measured.
             dataset = run.source.dataset
             box = {"env_low": dataset.env_low, "env_high": dataset.env_high}
-        self.controller = build.build_controller(
+        self.controller = assembly.build_controller(
             settings.controller,
             system.model,
             plant,
@@ -259,7 +259,7 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
             f"scenario={run.settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
         )
-    return build.build_in_lane(
+    return assembly.build_in_lane(
         inner,
         run.plant,
         system.law,

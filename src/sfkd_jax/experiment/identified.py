@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sfkd_jax import build, models, store
-from sfkd_jax.build import LoggedVehicleSettings
+from sfkd_jax import assembly, models, store
+from sfkd_jax.assembly import LoggedVehicleSettings
 from sfkd_jax.data import (
     PARTS,
     Columns,
@@ -130,15 +130,15 @@ def _ensure_identified(
     path = root / "vehicles" / folder / "vehicle.safetensors"
     with store.locked(path.parent, wait=True):  # other runs share the vehicle
         if not path.is_file():
-            plant = build.build_vehicle(vehicle)
+            plant = assembly.build_vehicle(vehicle)
             logged = read(plant, environment, vehicle).dataset
             names = _env_columns(environment, vehicle)
             env_low, env_high = _logged_env_box(logged, names)
             arrays = _identify(logged, vehicle.dt)
             arrays["env_low"] = env_low
             arrays["env_high"] = env_high
-            store.write_arrays(path, arrays, kind=build.IDENTIFIED, config=config)
-    arrays, _ = store.read_arrays(path, kind=build.IDENTIFIED, config=config)
+            store.write_arrays(path, arrays, kind=assembly.IDENTIFIED, config=config)
+    arrays, _ = store.read_arrays(path, kind=assembly.IDENTIFIED, config=config)
     return path, arrays
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import models, store
-from sfkd_jax.build import LOGGED
+from sfkd_jax.assembly import LOGGED
 from sfkd_jax.control import (
     TEXTBOOK,
     PathLaw,
@@ -116,7 +116,7 @@ def _step_of_model(simulate: _Simulation, name: str) -> Step:
 
     Args:
         simulate: what the law is for.
-        name: of the model, one of `build.LAW_MODELS`.
+        name: of the model, one of `assembly.LAW_MODELS`.
     """
     plant = simulate.plant
     if name in ("nominal", *TEXTBOOK):

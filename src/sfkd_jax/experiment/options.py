@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from sfkd_jax import build, data, evaluation, export, training
-from sfkd_jax.build import (
+from sfkd_jax import assembly, data, evaluation, export, training
+from sfkd_jax.assembly import (
     ControllerSettings,
     Directory,
     LawSettings,
@@ -57,7 +57,7 @@ class EnvironmentSettings:
     low: Bounds | None = None
     high: Bounds | None = None
     names: Names = ()
-    source: Annotated[str, OneOf(build.ENV_SOURCES)] = "measured"
+    source: Annotated[str, OneOf(assembly.ENV_SOURCES)] = "measured"
 
     @property
     def box(self) -> dict[str, Any]:
@@ -132,7 +132,7 @@ class AlongPathSettings(DatasetSettings):
         return options
 
 
-@build.takes_logs
+@assembly.takes_logs
 class LogSettings(DatasetSettings):
     """Recorded logs; the other fields are arguments of `data.from_logs`."""
 

@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
-from sfkd_jax import build
+from sfkd_jax import assembly
 from sfkd_jax.experiment.options import (
     AlongPathSettings,
     LogSettings,
@@ -22,9 +22,9 @@ def _schemas() -> dict[tuple[str, str], Any]:
     """Return the dataclass of every schema, by its group and name."""
     datasets = {"": SimulatedSettings, "path": AlongPathSettings, "files": LogSettings}
     variants: dict[str, Any] = {
-        "vehicle": build.VEHICLES,
-        "model": build.MODEL_SETTINGS,
-        "controller": build.CONTROLLER_SETTINGS,
+        "vehicle": assembly.VEHICLES,
+        "model": assembly.MODEL_SETTINGS,
+        "controller": assembly.CONTROLLER_SETTINGS,
         "dataset": datasets,
     }
     schemas = {}

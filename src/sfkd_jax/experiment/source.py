@@ -10,8 +10,8 @@ from typing import Any
 
 import jax
 
-from sfkd_jax import build, store
-from sfkd_jax.build import VehicleSettings
+from sfkd_jax import assembly, store
+from sfkd_jax.assembly import VehicleSettings
 from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset
 from sfkd_jax.experiment import data, dataset_files, identified, laws
@@ -80,7 +80,7 @@ class DataSource:
     @cached_property
     def plant(self) -> Vehicle:
         """The vehicle."""
-        return build.build_vehicle(self.vehicle)
+        return assembly.build_vehicle(self.vehicle)
 
     def check_plant(self) -> None:
         """Raise a ValueError if the vehicle cannot be simulated in its environment."""
@@ -112,7 +112,7 @@ class DataSource:
     def loop(self) -> Vehicle:
         """The closed loop of vehicle and law, in path coordinates."""
         law: Any = self.law
-        return build.build_loop(self.plant, law)
+        return assembly.build_loop(self.plant, law)
 
     @property
     def dataset(self) -> Dataset:

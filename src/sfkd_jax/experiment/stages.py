@@ -53,12 +53,12 @@ def check_settings(run: Run) -> None:
         )
     sizes = _sizes(run.source)
     law = _zero_law(sizes) if run.source.along_path else None
-    systems = ["self", *build.reference_systems(plant, law)]
+    systems = ["self", *assembly.reference_systems(plant, law)]
     if law is not None:
-        systems.extend(build.LAWS_ALONE)
+        systems.extend(assembly.LAWS_ALONE)
     for name in settings.evaluation.systems:
         choose(dict.fromkeys(systems), name, "evaluation.systems entry")
-    model = build.build_model(settings.model, _unit_space(sizes), plant)
+    model = assembly.build_model(settings.model, _unit_space(sizes), plant)
     if model.along_path != (law is not None):
         raise ValueError(
             "model.frame=path and dataset=path go together: "
@@ -66,10 +66,10 @@ def check_settings(run: Run) -> None:
         )
     if not plant.control_low:  # known from logs alone, and not driven
         return
-    build.build_scenario(
+    assembly.build_scenario(
         settings.scenario, plant, duration=settings.evaluation.episode_s
     )
-    build.build_controller(
+    assembly.build_controller(
         settings.controller,
         model,
         plant,

@@ -322,7 +322,7 @@ def _example_inputs(trained: Policy) -> tuple[Any, ...]:
     key = jax.eval_shape(partial(jax.random.key, 0))
     state = jax.eval_shape(trained.controller.init, key)
     settings = trained.settings
-    horizon = build.controller_horizon(settings["controller"])
+    horizon = assembly.controller_horizon(settings["controller"])
     return (
         key,
         state,

@@ -48,7 +48,7 @@ class Policy(TrainedModel):
         signature: who signed the certificate, its measured numbers included: "unsigned"
             or "signed by …".
         around: (planner=another along a path) -> controller, see
-            `build.build_controller`.
+            `assembly.build_controller`.
     """
 
     controller: Controller
@@ -117,7 +117,7 @@ class Policy(TrainedModel):
         names = self.interface["environment"]["names"]
         friction = [i for i, name in enumerate(names) if name.startswith("friction")]
         with jax.ensure_compile_time_eval():
-            controller = build.build_in_lane(
+            controller = assembly.build_in_lane(
                 self.controller,
                 self.vehicle,
                 law,
@@ -156,7 +156,7 @@ def load(
         path: path of the directory or of a policy.safetensors, or the name of a policy
             that ships, see `policies`.
         controller: settings of a controller to build instead of the saved one.
-        env_source: one of `build.ENV_SOURCES`. "estimated" for a policy in path
+        env_source: one of `assembly.ENV_SOURCES`. "estimated" for a policy in path
             coordinates that estimates the environment and ignores the one it is given;
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
@@ -195,7 +195,7 @@ def load(
         errors = store.as_artefact_error(file, ValueError)
     with errors:
         around = partial(
-            build.build_controller,
+            assembly.build_controller,
             settings["controller"],
             trained.model,
             trained.vehicle,
@@ -230,7 +230,7 @@ def _driving_settings(
     Args:
         saved: the settings in the file of the policy.
         controller: settings of a controller in place of the saved one, or None.
-        env_source: one of `build.ENV_SOURCES`.
+        env_source: one of `assembly.ENV_SOURCES`.
     """
     return {
         **saved,
@@ -245,7 +245,7 @@ def _check_env_source(env_source: str, reads_env: bool) -> None:
     What a model reads must come from somewhere; what it does not is not estimated.
     """
     impossible = "none" if reads_env else "estimated"
-    sources = [source for source in build.ENV_SOURCES if source != impossible]
+    sources = [source for source in assembly.ENV_SOURCES if source != impossible]
     if env_source not in sources:
         raise ValueError(
             f"env_source must be {' or '.join(sources)} for a policy that "

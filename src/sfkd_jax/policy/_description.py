@@ -24,7 +24,7 @@ def interface_of(
     labels = [entry.label for entry in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
-        "horizon": build.controller_horizon(trained.settings["controller"]),
+        "horizon": assembly.controller_horizon(trained.settings["controller"]),
         "controls": [
             {"name": control.label, "low": control.low, "high": control.high}
             for control in vehicle.controls

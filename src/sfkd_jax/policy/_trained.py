@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from sfkd_jax import build, store
+from sfkd_jax import assembly, store
 from sfkd_jax.control import PathLaw, law_from_arrays
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.policy._shipped import POLICY_FILE, SHIPPED, shipped_names
@@ -104,7 +104,7 @@ def restore(path: str | Path) -> TrainedModel:
     settings = manifest["config"]
     # Before anything is built: building imports and calls what the settings name.
     with store.as_artefact_error(file, ValueError):
-        build.check_imported(settings)
+        assembly.check_imported(settings)
     advice = f"saved by sfkd_jax {manifest['versions'].get('sfkd_jax')}: train again"
     with store.as_artefact_error(file, ValueError, advice=advice):
         vehicle, model = built(settings)
@@ -116,7 +116,9 @@ def restore(path: str | Path) -> TrainedModel:
             if not np.all(np.isfinite(leaf)):
                 raise store.ArtefactError(f"{file}: weights {name} are not finite")
         tables = _take_law(arrays)
-        build.check_consistent(settings, vehicle, tables if model.along_path else None)
+        assembly.check_consistent(
+            settings, vehicle, tables if model.along_path else None
+        )
         law = law_from_arrays(tables) if model.along_path else None
     return TrainedModel(
         model=model,
@@ -149,9 +151,9 @@ def built(settings: Values) -> tuple[Vehicle, Model]:
 def _built_from_json(settings: str) -> tuple[Vehicle, Model]:
     """Build vehicle and model; cached by settings as JSON to compile nothing twice."""
     parts = json.loads(settings)
-    vehicle = build.build_vehicle(parts["vehicle"])
-    space = build.space_from_settings(parts["space"])
-    return vehicle, build.build_model(parts["model"], space, vehicle)
+    vehicle = assembly.build_vehicle(parts["vehicle"])
+    space = assembly.space_from_settings(parts["space"])
+    return vehicle, assembly.build_model(parts["model"], space, vehicle)
 
 
 def policy_file(path: str | Path) -> Path:

@@ -106,7 +106,7 @@ class Planner(Stateful):
     where the reference cannot be followed, see `RolloutSetup.followable`.
 
     To write another planner, define `search` in a subclass. `factory(Mine,
-    Mine.controller)` is then its factory, and an entry in `build.PLANNERS` gives it
+    Mine.controller)` is then its factory, and an entry in `assembly.PLANNERS` gives it
     settings.
 
     Attributes:

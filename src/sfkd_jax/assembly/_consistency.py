@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax import plants
-from sfkd_jax.build._vehicles import FROM_OUTSIDE
+from sfkd_jax.assembly._vehicles import FROM_OUTSIDE
 from sfkd_jax.geometry import PATH_SPEED
 from sfkd_jax.settings import Values
 

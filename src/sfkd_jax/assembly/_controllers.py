@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfkd_jax import control, plants
-from sfkd_jax.build._controller_settings import (
+from sfkd_jax.assembly._controller_settings import (
     PLANNERS,
     ControllerSettings,
     SearchSettings,

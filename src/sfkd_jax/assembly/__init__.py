@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from sfkd_jax import control, models, plants, scenarios
-from sfkd_jax.build._consistency import check_consistent as check_consistent
-from sfkd_jax.build._consistency import check_imported as check_imported
-from sfkd_jax.build._controller_settings import (
+from sfkd_jax.assembly._consistency import check_consistent as check_consistent
+from sfkd_jax.assembly._consistency import check_imported as check_imported
+from sfkd_jax.assembly._controller_settings import (
     CONTROLLER_SETTINGS as CONTROLLER_SETTINGS,
 )
 from sfkd_jax.build._controller_settings import ENV_SOURCES as ENV_SOURCES
