@@ -41,11 +41,11 @@ ARROWS = {
     "data": PLANT | {"store"},
     "evaluation": PLANT,
     "certification": PARTS | {"certificate"},
-    "build": PARTS | {"certificate", "models", "settings", "store"},
-    "policy": PARTS | {"build", "certificate", "certification", "settings", "store"},
-    "export": CORE | {"build", "certificate", "policy", "settings", "store"},
-    "adapters": PLANT | {"build"},
-    "report": {"build", "certificate", "evaluation", "plants", "store"},
+    "assembly": PARTS | {"certificate", "models", "settings", "store"},
+    "policy": PARTS | {"assembly", "certificate", "certification", "settings", "store"},
+    "export": CORE | {"assembly", "certificate", "policy", "settings", "store"},
+    "adapters": PLANT | {"assembly"},
+    "report": {"assembly", "certificate", "evaluation", "plants", "store"},
     "__init__": {"export", "geometry", "info", "policy", "store"},
 }
 ARROWS |= {"experiment": set(ARROWS)}

@@ -10,7 +10,7 @@ import pytest
 from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 
-from sfkd_jax import build, data, evaluation, models, plants, policy
+from sfkd_jax import assembly, data, evaluation, models, plants, policy
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.plants import StateVariable
 from sfkd_jax.report.run import write_report

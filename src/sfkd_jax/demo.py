@@ -32,7 +32,7 @@ def main(run: Run) -> dict[str, Any]:
     run = Run(settings, run.source)
     episodes = evaluating.make_episodes(run)
     home = Path(settings.root) / settings.name / f"{episodes.name}_{shipped}"
-    references = build.reference_systems(run.plant, trained.law)
+    references = assembly.reference_systems(run.plant, trained.law)
     corridor = trained.certificate.corridor if trained.certificate else None
     systems = {
         trained.settings["model"]["system"]: assembly.System(

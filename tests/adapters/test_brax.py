@@ -13,7 +13,7 @@ from brax import envs
 from brax.envs.wrappers.training import EvalWrapper, wrap
 from helpers import at, jit, same
 
-from sfkd_jax import adapters, build, control, evaluation, geometry, plants
+from sfkd_jax import adapters, assembly, control, evaluation, geometry, plants
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.types import Controller
 

@@ -23,7 +23,7 @@ from helpers import (
 )
 from jaxtyping import jaxtyped
 
-from sfkd_jax import build, control, models, plants
+from sfkd_jax import assembly, control, models, plants
 from sfkd_jax.info import (
     AdaptationInfo,
     Claim,

@@ -11,7 +11,7 @@ import pytest
 from helpers import any_law, jit, tiny
 
 import sfkd_jax
-from sfkd_jax import build, control, scenarios
+from sfkd_jax import assembly, control, scenarios
 from sfkd_jax.certificate import (
     Boxes,
     JointBounds,
@@ -452,7 +452,7 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     made, shield = {}, control.Shield
     record = lambda **options: made.update(options) or shield(**options)
     monkeypatch.setattr(control, "Shield", record)
-    in_corridor = partial(build.in_corridor, scripted(), TOY, kinematic(), LAW)
+    in_corridor = partial(assembly.in_corridor, scripted(), TOY, kinematic(), LAW)
 
     def build_with(corridor):
         in_corridor(replace(certificate, measured=measured, corridor=corridor))

@@ -18,23 +18,27 @@ from sfkd_jax.assembly._consistency import check_imported as check_imported
 from sfkd_jax.assembly._controller_settings import (
     CONTROLLER_SETTINGS as CONTROLLER_SETTINGS,
 )
-from sfkd_jax.build._controller_settings import ENV_SOURCES as ENV_SOURCES
-from sfkd_jax.build._controller_settings import PLANNERS as PLANNERS
-from sfkd_jax.build._controller_settings import ControllerSettings as ControllerSettings
-from sfkd_jax.build._controller_settings import controller_horizon as controller_horizon
-from sfkd_jax.build._controllers import build_controller as build_controller
-from sfkd_jax.build._controllers import build_in_lane as build_in_lane
-from sfkd_jax.build._corridor import corridor_of as corridor_of
-from sfkd_jax.build._corridor import in_corridor as in_corridor
-from sfkd_jax.build._vehicles import IDENTIFIED as IDENTIFIED
-from sfkd_jax.build._vehicles import LOGGED as LOGGED
-from sfkd_jax.build._vehicles import PLANTS as PLANTS
-from sfkd_jax.build._vehicles import VEHICLES as VEHICLES
-from sfkd_jax.build._vehicles import LoggedVehicleSettings as LoggedVehicleSettings
-from sfkd_jax.build._vehicles import VehicleSettings as VehicleSettings
-from sfkd_jax.build._vehicles import build_driver as build_driver
-from sfkd_jax.build._vehicles import build_vehicle as build_vehicle
-from sfkd_jax.build._vehicles import takes_logs as takes_logs
+from sfkd_jax.assembly._controller_settings import ENV_SOURCES as ENV_SOURCES
+from sfkd_jax.assembly._controller_settings import PLANNERS as PLANNERS
+from sfkd_jax.assembly._controller_settings import (
+    ControllerSettings as ControllerSettings,
+)
+from sfkd_jax.assembly._controller_settings import (
+    controller_horizon as controller_horizon,
+)
+from sfkd_jax.assembly._controllers import build_controller as build_controller
+from sfkd_jax.assembly._controllers import build_in_lane as build_in_lane
+from sfkd_jax.assembly._corridor import corridor_of as corridor_of
+from sfkd_jax.assembly._corridor import in_corridor as in_corridor
+from sfkd_jax.assembly._vehicles import IDENTIFIED as IDENTIFIED
+from sfkd_jax.assembly._vehicles import LOGGED as LOGGED
+from sfkd_jax.assembly._vehicles import PLANTS as PLANTS
+from sfkd_jax.assembly._vehicles import VEHICLES as VEHICLES
+from sfkd_jax.assembly._vehicles import LoggedVehicleSettings as LoggedVehicleSettings
+from sfkd_jax.assembly._vehicles import VehicleSettings as VehicleSettings
+from sfkd_jax.assembly._vehicles import build_driver as build_driver
+from sfkd_jax.assembly._vehicles import build_vehicle as build_vehicle
+from sfkd_jax.assembly._vehicles import takes_logs as takes_logs
 from sfkd_jax.certificate import Certificate
 from sfkd_jax.settings import (
     BelowRoot,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.certificate import (
     AxisNames,
     Certificate,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sfkd_jax import build, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.certificate import write
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road

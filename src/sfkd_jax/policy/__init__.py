@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import build, store
+from sfkd_jax import assembly, store
 from sfkd_jax.certificate import Certificate, describe_signature
 from sfkd_jax.control import in_the_world
 from sfkd_jax.geometry import relative, shifted

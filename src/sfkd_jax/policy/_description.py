@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from sfkd_jax import build
+from sfkd_jax import assembly
 from sfkd_jax.certificate import Certificate, Conditions
 from sfkd_jax.plants import axes
 from sfkd_jax.policy._trained import TrainedModel

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from sfkd_jax import store
-from sfkd_jax.build import build_vehicle
+from sfkd_jax.assembly import build_vehicle
 from sfkd_jax.certificate import signature_of
 from sfkd_jax.evaluation import SHARED, formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
