@@ -4,7 +4,7 @@
 
 Three systems drive the true cars on the same roads, with the schedule and the sensor noise
 of S3: the policy in its lane; MPPI that knows the car (oracle), whose plans must keep clear
-of what is in view; and the same inside the shield and gate of the policy (its guard), along
+of what is in view; and the same inside the gate and shield of the policy, along
 the road. The results go to benchmarks/lane.json, one line a row. A row that is there is not
 measured again.
 """
@@ -65,7 +65,7 @@ class Car:
         clear = control.constrained(task, partial(too_near, self.plant.size), nothing)
         planner = control.mppi(clear, num_samples=self.samples, horizon=HORIZON)
         free = Controller(planner.init, lambda _, *rest: planner.act({}, *rest))
-        return on_road(self.policy.guard(free) if name.endswith(GUARDED) else free)
+        return on_road(self.policy.shield(free) if name.endswith(GUARDED) else free)
 
     def program(self, name):
         """(scenarios) -> what is recorded of their episodes, (run, time)."""

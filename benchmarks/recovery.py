@@ -4,7 +4,7 @@
 
 The cars are the true ones, and their sensors fail in named ways. Every run is a row of
 arrays (`Runs`), so that each of three controllers compiles once: the policy, a request
-inside the shield and gate of the policy (its guard), and the same request without them. The
+inside the gate and shield of the policy, and the same request without them. The
 results go to benchmarks/recovery.json, one line a row.
 """
 
@@ -122,14 +122,14 @@ class Car:
         self.bare = self.program(partial(self.asking, guard=False))
 
     def asking(self, now, *, guard):
-        """A request of `KINDS` in the world, inside the policy's guard or without it."""
+        """A request of `KINDS` in the world, inside the policy's shield or without it."""
         plant = self.loaded.vehicle
         law = self.loaded.law
         planner = request(law, plant.control_low, plant.control_high, now)
         if guard:
-            # The guard is made of numbers, also while a program is traced.
+            # The shield is made of numbers, also while a program is traced.
             with jax.ensure_compile_time_eval():
-                return self.loaded.guard(planner, along_path=True)
+                return self.loaded.shield(planner, along_path=True)
         return control.along_reference(planner, coordinates=law.gain.shape[-1])
 
     def program(self, make):
@@ -352,7 +352,7 @@ def claimed(made, corridor):
         "departures": int((far > DEPARTED).any(axis=1).sum()),
         "largest_m": shown(far.max()),
     }
-    # Without a guard nothing is claimed.
+    # Without a shield nothing is claimed.
     if "bound" not in made:
         return whole
     claims = made["bound"]

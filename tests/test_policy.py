@@ -125,7 +125,7 @@ def scripted(controls):
 
 
 @pytest.mark.parametrize("vehicle", ["dynamic_path", "kinematic_path"])
-def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
+def test_any_planner_stays_in_the_corridor_behind_the_shield(vehicle):
     """On the true plant, while friction and wind jump; one program for all planners."""
     trained, steps, draw = load(vehicle), 150, np.random.default_rng(0)
     swerving = np.sign(np.sin(2 * np.pi * np.arange(steps) / 40))
@@ -143,15 +143,15 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
     @jax.jit
     @jax.vmap
     def drive(script):
-        guarded = trained.guard(scripted(script))
+        shielded = trained.shield(scripted(script))
 
         def step(carry, k):
             x, memory = carry
             e, road = envs[k // 40], straight(20, speed=9.5).at[:, 0].add(x[0])
-            u, memory, info = guarded.act(trained.params, memory, x, e, road)
+            u, memory, info = shielded.act(trained.params, memory, x, e, road)
             return (plant.step(x, u, e), memory), (x[1], info)
 
-        begin = start(vehicle).at[3].set(9.5), guarded.init(KEY)
+        begin = start(vehicle).at[3].set(9.5), shielded.init(KEY)
         return jax.lax.scan(step, begin, jnp.arange(steps))[1]
 
     lateral, info = drive(controls)
@@ -162,16 +162,16 @@ def test_any_planner_stays_in_the_corridor_behind_the_guard(vehicle):
     assert info.planner["mine"].shape == lateral.shape
 
 
-def test_what_planners_add_to_the_model_reaches_no_guard():
+def test_what_planners_add_to_the_model_reaches_no_shield():
     """And of what is not finite the law drives, inside the corridor."""
     trained, x = load("kinematic_path"), start("kinematic").at[1].set(0.05)
-    guarded = trained.guard(scripted(jnp.tile(jnp.asarray([0.1, 0.0]), (20, 1))))
-    act, guard = jax.jit(trained.controller.act), jax.jit(guarded.act)
+    shielded = trained.shield(scripted(jnp.tile(jnp.asarray([0.1, 0.0]), (20, 1))))
+    act, shielded_act = jax.jit(trained.controller.act), jax.jit(shielded.act)
     told, memory, weights = [], trained.controller.init(KEY), trained.params.weights
     for size in (0.0, 1.0, 1e30, np.nan):
         more = jax.tree.map(lambda leaf, size=size: leaf + size, weights["planning"])
         params = trained.params._replace(weights={**weights, "planning": more})
-        told.append(guard(params, guarded.init(KEY), x, ENV, straight(20)))
+        told.append(shielded_act(params, shielded.init(KEY), x, ENV, straight(20)))
         u, _, info = act(params, memory, x, ENV, straight(20))
         assert bool(info.claim.holds)
         assert float(info.shield.margin) > 0.0
@@ -182,12 +182,12 @@ def test_what_planners_add_to_the_model_reaches_no_guard():
     assert all(same(one, told[0], rtol=0, atol=0) for one in told[1:])
 
 
-def test_a_planner_in_a_guard_sees_what_the_gate_believes():
+def test_a_planner_in_a_shield_sees_what_the_gate_believes():
     """The observation bit for bit, or where the car would be, if that has jumped."""
     trained = load("kinematic_path")
     plan = lambda params, state, x, env, road: (jnp.zeros(2), state, {"seen": x})
-    guarded = trained.guard(Controller(lambda key: (), plan))
-    state, act = guarded.init(KEY), jax.jit(guarded.act)
+    shielded = trained.shield(Controller(lambda key: (), plan))
+    state, act = shielded.init(KEY), jax.jit(shielded.act)
     x, faults = start("kinematic").at[1].set(0.05), {3: [0.0, 3.0, 0.0, 0.0]}
     faults |= {4: [-7.0, 1.0, 0.3, 0.0], 5: [np.nan] * 4}
     for k in range(7):
@@ -199,19 +199,19 @@ def test_a_planner_in_a_guard_sees_what_the_gate_believes():
         x = trained.vehicle.step(x, u, ENV)
 
 
-def test_a_guard_needs_a_corridor_and_a_control_of_the_vehicle():
+def test_a_shield_needs_a_corridor_and_a_control_of_the_vehicle():
     with pytest.raises(ValueError, match="no certified corridor"):
-        load("dynamic").guard(scripted(jnp.zeros((1, 2))))
+        load("dynamic").shield(scripted(jnp.zeros((1, 2))))
     trained = load("kinematic_path")
     inputs = start("kinematic"), ENV, straight(20)
-    wide, own = map(trained.guard, (scripted(jnp.zeros((1, 3))), trained.controller))
+    wide, own = map(trained.shield, (scripted(jnp.zeros((1, 3))), trained.controller))
     with pytest.raises(ValueError, match=r"control has shape \(2,\), got \(3,\)"):
         jax.eval_shape(wide.act, trained.params, wide.init(KEY), *inputs)
     _, state, info = jax.eval_shape(own.act, trained.params, own.init(KEY), *inputs)
     assert jax.tree.structure(state) == jax.tree.structure(own.init(KEY))
     assert info.plan.states.shape == (20, 4)
     lawful = control.in_the_world(scripted(jnp.zeros((1, 2))))
-    along = trained.guard(lawful, along_path=True)
+    along = trained.shield(lawful, along_path=True)
     jax.eval_shape(along.act, trained.params, along.init(KEY), *inputs)
 
 

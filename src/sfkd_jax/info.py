@@ -274,7 +274,7 @@ class ControllerInfo(NamedTuple):
         shield: the safety filter.
         lane: the choice of a reference.
         gap: true distance from the nearest obstacle, as a simulation knows it [m].
-        planner: what a planner from outside this package reports, see `Policy.guard`.
+        planner: what a planner from outside this package reports, see `Policy.shield`.
     """
 
     plan: PlanInfo = PlanInfo()

@@ -701,7 +701,7 @@ def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(ca
         return control, memory, about(xi, preview)
 
     planner = Controller(lambda key: (), follows)
-    guard = policy.guard(planner, along_path=True)
+    shielded = policy.shield(planner, along_path=True)
     time = 0.1 * np.arange(200)
     stop = np.clip(10.0 - 2.5 * (time - 1.5), 0.0, 10.0)
     speed = np.where(time < 12.5, stop, np.clip(2.0 * (time - 12.5), 0.0, 8.5))
@@ -721,14 +721,14 @@ def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(ca
             window = jax.lax.dynamic_slice_in_dim(points, k + 1, HORIZON)
             foot = scenarios.project(road.path, state[:2], jnp.asarray(along)[k])
             seen = state + noise * jax.random.normal(sensors[k], state.shape)
-            action, memory, info = guard.act(
+            action, memory, info = shielded.act(
                 policy.params, memory, seen, road.envs[k], window
             )
             after = plant.step(state, action, road.envs[k])
             told = info.claim.bound, info.shield.rolling, info.claim.holds
             return (after, memory), (*foot, state[3], *told)
 
-        start = road.initial_state, guard.init(key)
+        start = road.initial_state, shielded.init(key)
         return jax.lax.scan(step, start, jnp.arange(179))[1]
 
     seeds = jax.random.split(jax.random.key(5), 4)

@@ -75,13 +75,13 @@ class Policy(TrainedModel):
             )
         return self.certificate
 
-    def guard(self, planner: Controller, *, along_path: bool = False) -> Controller:
+    def shield(self, planner: Controller, *, along_path: bool = False) -> Controller:
         """Return any planner behind the shield of this policy, to be called like it.
 
         Args:
             planner: its `act` receives the params of the policy (bind others with
                 `partial`), the observation, e and the reference, and returns a control
-                of the vehicle. Its `info` is the part `planner` of that of the guard.
+                of the vehicle. Its `info` is the part `planner` of the result.
             along_path: whether it takes ξ and a preview instead of observation and
                 reference, see `control.along_reference`.
 
