@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import optimised
 
 import sfkd_jax
 
@@ -25,7 +26,7 @@ def recorded():
 def test_a_shipped_policy_is_certified_and_acts_as_recorded(name, recorded):
     policy = sfkd_jax.load(PRETRAINED / name)
     assert policy.certificate is not None
-    act = jax.jit(policy.controller.act)
+    act = optimised(policy.controller.act)
     for scenario in ("s1", "s2", "s3"):
         states, envs, references, controls = (
             recorded[f"{name}/{scenario}/{key}"] for key in "xeru"

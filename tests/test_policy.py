@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import same, straight
+from helpers import optimised, same, straight
 
 import sfkd_jax
 from sfkd_jax import control, policy
@@ -219,7 +219,7 @@ def test_a_shield_needs_a_corridor_and_a_control_of_the_vehicle():
 def test_a_policy_drives_on_earth_as_it_does_at_the_origin(vehicle):
     """On a road of any yaw, told in float64; in float32 alone it says that it cannot."""
     trained = load(vehicle)
-    act, step = jax.jit(trained.controller.act), jax.jit(trained.vehicle.step)
+    act, step = optimised(trained.controller.act), jax.jit(trained.vehicle.step)
 
     def drive(far, yaw, convert):
         turn = np.asarray([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])

@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from composing import settings
+from composing import run
 from documents import hashed, policy_copy
 from helpers import put, refusal_of
 
@@ -142,6 +142,6 @@ def test_without_cryptography_a_signature_is_not_believed(monkeypatch):
 
 
 def test_a_key_that_is_none_stops_the_command_before_it_trains(tmp_path):
-    asked = settings(f"root={tmp_path}", f"certification.signing_key={tmp_path}/none")
+    asked = run(f"root={tmp_path}", f"certification.signing_key={tmp_path}/none")
     assert refusal_of(lambda: stages.certify_policy(asked))
-    assert not asked.run_dir.exists()
+    assert not asked.directory.exists()
