@@ -303,10 +303,10 @@ class ControllerInfo(NamedTuple):
 
 
 def reported(info: Any) -> ControllerInfo:
-    """Return what a planner reports; that of one from outside becomes a part.
+    """Return what a controller reports; that of one from outside becomes a part.
 
     Args:
-        info: `ControllerInfo`, or anything else. An attribute or entry `healthy` of it
+        info: `ControllerInfo`, or anything else; an entry `healthy` of a dictionary
             counts.
     """
     if isinstance(info, ControllerInfo):

@@ -35,6 +35,7 @@ from sfkd_jax.info import (
     Reason,
     ShieldInfo,
     first,
+    reported,
 )
 from sfkd_jax.rollout import fold, with_offset
 
@@ -390,3 +391,14 @@ def test_a_controller_is_healthy_where_nothing_speaks_against_its_plan(reason):
     info = ControllerInfo(claim=Claim(reason=jnp.asarray(reason)))
     assert bool(info.healthy) == (reason in usual)
     assert not bool(info._replace(plan=PlanInfo(healthy=jnp.asarray(False))).healthy)
+
+
+@pytest.mark.parametrize(
+    ("told", "healthy"),
+    [(None, True), ({}, True), ({"healthy": False}, False), (("x", 1.0), True)],
+)
+def test_what_a_controller_from_outside_reports_becomes_a_part(told, healthy):
+    info = reported(told)
+    assert info.planner is told
+    assert bool(info.healthy) == healthy
+    assert reported(info) is info

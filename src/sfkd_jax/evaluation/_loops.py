@@ -19,6 +19,7 @@ from sfkd_jax.geometry import (
     path_coordinates,
     wrap_angle,
 )
+from sfkd_jax.info import reported
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
 from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors
@@ -137,6 +138,7 @@ def simulate(
         control, memory, info = controller.act(
             params, memory, observation, observed_env, ahead
         )
+        info = reported(info)
         state = plant(state, control, env)
         # The guess moves on at the reference speed. Where the path crosses itself, the
         # foot point therefore stays on the right branch.

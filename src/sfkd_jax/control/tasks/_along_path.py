@@ -154,6 +154,7 @@ class AlongReference(Stateful):
             ),
         )
         control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
+        info = reported(info)
         planned = info.plan.states
         if planned is not None:
             states = jax.vmap(beside)(planned, points)

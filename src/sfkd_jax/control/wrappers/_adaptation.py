@@ -28,7 +28,7 @@ from sfkd_jax.control.wrappers._estimator import (
 )
 from sfkd_jax.control.wrappers._innovations import expected_coordinates
 from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
-from sfkd_jax.info import AdaptationInfo, ControllerInfo
+from sfkd_jax.info import AdaptationInfo, ControllerInfo, reported
 from sfkd_jax.ranges import (
     AtLeastTwo,
     Fraction,
@@ -242,7 +242,7 @@ class Adaptation(Stateful):
             adapting=adapting,
         )
         belief = belief._replace(applied=Applied(control, road, env))
-        info = info._replace(adaptation=adaptation)
+        info = reported(info)._replace(adaptation=adaptation)
         return control, AdaptiveState(inner, belief), info
 
     @cached_property

@@ -37,7 +37,7 @@ from sfkd_jax.control.wrappers._plausibility import (
     difference,
 )
 from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, put
-from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first
+from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first, reported
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -218,6 +218,7 @@ class Gate(Stateful):
         control, inner, info = self.inner.act(
             params, state.inner, believed.xi, inputs.env, shown
         )
+        info = reported(info)
         expected = self._expect(
             params, inputs, believed, road, control, info, tested.state
         )
