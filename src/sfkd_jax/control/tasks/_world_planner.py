@@ -37,24 +37,24 @@ def in_the_world(planner: Controller) -> Controller:
         # What an adaptation adds to the model is not that of another planner.
         if isinstance(params, Offset):
             params = params.params
-        believed = _in_the_world(xi, preview)
+        believed = _state_of(xi, preview)
         seen = jnp.where(jnp.all(preview.measured), preview.observation, believed)
-        planned, memory, reported_info = planner.act(
+        planned, memory, told = planner.act(
             params, memory, seen, env, preview.reference
         )
         planned = jnp.asarray(planned, dtype=float)
         if planned.shape != (2,):
             raise ValueError(f"a planner's control has shape (2,), got {planned.shape}")
-        info = reported(reported_info)
+        info = reported(told)
         working = all_finite(planned) & info.healthy
         # Its predicted states are in the world, and those along a path are ξ.
         plan = info.plan._replace(healthy=working, states=None)
-        return planned, memory, ControllerInfo(plan=plan, planner=reported_info)
+        return planned, memory, ControllerInfo(plan=plan, planner=told)
 
     return Controller(planner.init, act)
 
 
-def _in_the_world(xi: PathState, preview: Preview) -> State:
+def _state_of(xi: PathState, preview: Preview) -> State:
     """Return the state of a vehicle at ξ beside its reference."""
     curvature = preview.road[0, 0]
     along = preview.along
