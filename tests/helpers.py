@@ -17,6 +17,7 @@ from safetensors.numpy import save
 
 from sfkd_jax import certification, control, models, plants, store
 from sfkd_jax import data as datasets
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -53,8 +54,13 @@ VARIANTS = {
     "no_residual": {"residual": "none"},
     "no_contraction": {"residual": "free"},
     "soft": {"residual": "free", "soft_penalty": 1.0},
-    "path": {"frame": "path"},
-    "state": {"frame": "path", "transport": False, "lift": "state", "scheduled": True},
+    "path": {"frame": PATH_FRAME},
+    "state": {
+        "frame": PATH_FRAME,
+        "transport": False,
+        "lift": "state",
+        "scheduled": True,
+    },
 }
 HARD = ("sfkd", "no_fiber", "no_transport")
 """Variants whose operator and residual are each bounded by construction (and are

@@ -11,6 +11,7 @@ from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 
 from sfkd_jax import assembly, data, evaluation, models, plants, policy
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.plants import StateVariable
 from sfkd_jax.report.run import write_report
@@ -131,7 +132,7 @@ def test_the_page_of_a_run_names_its_axes(registered, tmp_path):
 
 def built(plant, **adaptation):
     """A controller along a path with adaptation, of a model that knows the car."""
-    model = models.physics(assembly.build_loop(plant, LAW).step, along_path=True)
+    model = models.physics(assembly.build_loop(plant, LAW).step, frame=PATH_FRAME)
     options = {
         "name": "mppi",
         "planner": "mppi",

@@ -23,6 +23,7 @@ from sfkd_jax.types import (
     POSE,
     Control,
     Environment,
+    Frame,
     Pose,
     Reference,
     Scalar,
@@ -163,6 +164,27 @@ REFERENCE_SPEED = 3
 SMALLEST_SCALE = 0.2
 """Lower limit of 1 − κ e_y. Below it the car is so close to the path's centre of
 curvature that path coordinates are not meaningful.
+"""
+
+
+def _at_reference_speed(inputs: Control, size: int) -> PathState:
+    """Return ξ of a vehicle on its path, at the reference speed."""
+    return jnp.zeros(size).at[PATH_SPEED].set(inputs[1])
+
+
+PATH_FRAME = Frame(
+    name="path",
+    has_pose=False,
+    outputs={"position": slice(3, 4), "yaw": slice(4, 5), "body": slice(5, None)},
+    angles=(4,),
+    # Body rates and steering move the car along a path only in later steps.
+    lengths=(1.0, 1.0, 5.0, 1.0, 5.0),
+    length=0.05,
+    inputs=2,
+    following=_at_reference_speed,
+)
+"""Path coordinates: the body state is ξ, and the inputs are ρ = (κ [1/m], v_ref [m/s]).
+The outputs "position" and "yaw" are e_y and e_ψ.
 """
 
 PathFeedback: TypeAlias = Callable[[PathState, Scalar, Scalar, Environment], Control]

@@ -130,9 +130,9 @@ def with_offset(model: Model) -> Model:
     def transport(before: Offset, after: Offset, latent: Latent) -> Latent:
         return model.transport(before.params, after.params, latent)
 
-    def on_road(fiber: Offset, road: Control) -> Offset:
-        assert model.on_road is not None
-        return fiber._replace(params=model.on_road(fiber.params, road))
+    def on_reference(fiber: Offset, inputs: Control) -> Offset:
+        assert model.on_reference is not None
+        return fiber._replace(params=model.on_reference(fiber.params, inputs))
 
     def unwrapped(function: Callable[..., Any] | None) -> Any:
         """Call a function of the model with what the `Offset` wraps."""
@@ -156,7 +156,7 @@ def with_offset(model: Model) -> Model:
         # The parameters inside of an `Offset` are folded, not the `Offset`.
         shared=None,
         fitting=model.fitting._replace(step_fiber=None),
-        on_road=None if model.on_road is None else on_road,
+        on_reference=None if model.on_reference is None else on_reference,
         structure=Structure(
             explicit=unwrapped(structure.explicit), rate=unwrapped(structure.rate)
         ),
@@ -281,7 +281,7 @@ def state_errors(
 ) -> Float[Array, "time state"]:
     """Return predicted minus true states.
 
-    The columns are the position error along and across the true heading [m], the
+    The columns are the position error along and across the true yaw [m], the
     wrapped yaw error [rad] and the error of the body state.
     """
     position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])

@@ -1,4 +1,4 @@
-"""Shared types: what vehicles, models, controllers and certificates exchange.
+"""Shared types: what systems, models, controllers and certificates exchange.
 
 Symbols, used in every package: state x = (pose g in SE(2), body state s), control u,
 environment e, latent z. Every function named here works on one sample; callers vmap.
@@ -6,7 +6,7 @@ environment e, latent z. Every function named here works on one sample; callers 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -33,7 +33,59 @@ GRAVITY = 9.81
 POSE = slice(0, 3)
 """Entries of the pose (p_x [m], p_y [m], yaw [rad]) in a state."""
 BODY = slice(3, None)
-"""Entries of the body state: v [m/s], then the other states of the vehicle."""
+"""Entries of the body state in a state."""
+
+
+def _at_zero(inputs: Control, size: int) -> Float[Array, " body"]:
+    """Return a body state of zeros."""
+    return jnp.zeros(size)
+
+
+# Identity decides equality, so that a frame can be a static argument of a program.
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The coordinates in which a model is learned, and its errors are bounded.
+
+    A frame has a pose in the plane, which steps move, or it has none. Without a pose
+    the first three entries of a state are 0, and the body state is all that a model
+    knows, for instance the deviation from a reference. A control may then contain
+    inputs ρ, which a step needs from that reference.
+
+    Attributes:
+        name: of the frame.
+        has_pose: whether states have a pose.
+        inputs: number of entries of ρ, the last entries of a control.
+        following: (ρ, size of the body state) -> body state of a system that follows
+            its reference exactly; a planner's model is linearised there.
+        outputs: entries of a state, for each output that a certificate bounds.
+        angles: entries of a state that are angles [rad].
+        lengths: what an error of 1 in each of the first entries of a state counts in a
+            training loss [m].
+        length: what half the width of any other entry counts there [m].
+    """
+
+    name: str
+    has_pose: bool
+    outputs: Mapping[str, slice]
+    angles: tuple[int, ...]
+    lengths: tuple[float, ...]
+    length: float
+    inputs: int = 0
+    following: Callable[[Control, int], Float[Array, " body"]] = _at_zero
+
+
+BODY_FRAME = Frame(
+    name="body",
+    has_pose=True,
+    outputs={"position": slice(0, 2), "yaw": slice(2, 3), "body": BODY},
+    angles=(2,),
+    # A radian counts the way of half a second at 10 m/s.
+    lengths=(1.0, 1.0, 5.0),
+    length=0.2,
+)
+"""The frame of the body: a step moves the pose by an increment that does not depend on
+the pose, and nothing refers to a reference.
+"""
 
 
 class Space(NamedTuple):
@@ -205,11 +257,11 @@ class Model(NamedTuple):
         vector: latent -> z, the coordinates in which contraction is claimed, (rank,).
         shared: params -> the part of every fiber that does not depend on e, computed
             once before driving; None if there is no such part.
-        on_road: (fiber, (κ, v_ref)) -> the fiber of steps on that road, which all
-            samples of a planner share; None if it is the same.
+        on_reference: (fiber, ρ) -> the fiber of steps with these inputs from the
+            reference, which all samples of a planner share; None if it is the same.
         fitting: how the parameters are fitted.
         structure: what is known by construction.
-        along_path: whether states and controls are those of `geometry`.
+        frame: the coordinates of states, and the inputs of controls.
         planning: the model that planners roll out in place of this one, with the same
             params; None for this one. Nothing is certified of it.
     """
@@ -223,10 +275,10 @@ class Model(NamedTuple):
     observe: Callable[[Fiber, Latent, State], Latent]
     vector: Callable[[Latent], Float[Array, " rank"]]
     shared: Callable[[Params], Any] | None = None
-    on_road: Callable[[Fiber, Control], Fiber] | None = None
+    on_reference: Callable[[Fiber, Control], Fiber] | None = None
     fitting: Fitting = Fitting()
     structure: Structure = Structure()
-    along_path: bool = False
+    frame: Frame = BODY_FRAME
     planning: Model | None = None
 
 

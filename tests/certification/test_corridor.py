@@ -27,6 +27,7 @@ from sfkd_jax.certification._tubes import (
     corridor_coverage,
 )
 from sfkd_jax.certification.corridor import closed_loop, measure_corridor
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.plants import kinematic
 
 NAMES = (*JOINT, *ALONE)
@@ -78,7 +79,7 @@ DATA = BOX | {
 
 def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     """As `certify` makes it, with fewer and shorter runs."""
-    options = TINY | {"frame": "path", "transport": False, "budget": "joint"}
+    options = TINY | {"frame": PATH_FRAME, "transport": False, "budget": "joint"}
     model = models.sfkd(path_space(), **options)
     params = model.init(jax.random.key(0))
     loop = closed_loop(kinematic(), model, params, any_law(), (0.015, 0.015, 0.002))

@@ -26,6 +26,7 @@ from sfkd_jax.certification._metric_claims import (
 from sfkd_jax.certification._metrics import accepted_metric, propose_metric
 from sfkd_jax.certification._tubes import radii
 from sfkd_jax.certification._weights import exported
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Declared, Trajectory
 
@@ -105,7 +106,7 @@ def test_what_may_have_a_metric_is_a_polytope_without_transport_and_decoder():
 # --- of a model -----------------------------------------------------------------------
 
 OPTIONS = TINY | {
-    "frame": "path",
+    "frame": PATH_FRAME,
     "transport": False,
     "budget": "joint",
     "forcing_hidden": 4,

@@ -12,13 +12,13 @@ from sfkd_jax import assembly, certification, control, models, plants
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.control.wrappers import _estimator as estimator
 from sfkd_jax.control.wrappers._adaptation import _compensation
-from sfkd_jax.geometry import path_state
+from sfkd_jax.geometry import PATH_FRAME, path_state
 from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
 PLANT, LAW = plants.kinematic(), any_law()
-MODEL = models.physics(assembly.build_loop(PLANT, LAW).step, along_path=True)
+MODEL = models.physics(assembly.build_loop(PLANT, LAW).step, frame=PATH_FRAME)
 """The true loop as a model, so that every estimate has an exact answer."""
 LOOP = estimator.Loop(MODEL, LAW, jnp.asarray(ENV_LOW), jnp.asarray(ENV_HIGH))
 NOISE = np.float32([0.015, 0.002, 0.03])

@@ -24,6 +24,7 @@ from helpers import (
 from jaxtyping import jaxtyped
 
 from sfkd_jax import assembly, control, models, plants
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.info import (
     AdaptationInfo,
     Claim,
@@ -105,7 +106,7 @@ def around_law(model, law):
 
 def path_model():
     """A tiny SFKD in path coordinates and its initial parameters, folded."""
-    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame="path")
+    model = models.sfkd(path_space(), **TINY | {"budget": "joint"}, frame=PATH_FRAME)
     return model, jit(partial(fold, model))(jit(model.init)(jax.random.key(0)))
 
 

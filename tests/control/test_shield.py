@@ -20,7 +20,7 @@ from sfkd_jax.certificate import (
     read,
 )
 from sfkd_jax.control import Conditions, along_reference, safety_filter
-from sfkd_jax.geometry import path_state, vehicle_state
+from sfkd_jax.geometry import PATH_FRAME, path_state, vehicle_state
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.plants import kinematic
 from sfkd_jax.policy import SHIPPED
@@ -59,7 +59,7 @@ def toy():
         transport=lambda env, after, latent: latent * (1.0 + after[0]) / (1.0 + env[0]),
         observe=lambda env, latent, state: (1.0 + env[0]) * state[BODY],
         vector=lambda latent: latent,
-        along_path=True,
+        frame=PATH_FRAME,
     )
 
 

@@ -162,7 +162,7 @@ def test_what_is_certified_is_what_is_multiplied_by(name, one):
     assert same(explicit.residual, residual, rtol=0, atol=0)
     assert bool(explicit.residual) == (name != "no_residual")
     assert same(explicit.decoder[:-1], decoder[:-1], rtol=0, atol=0)
-    assert bool(explicit.decoder) == (not model.along_path)
+    assert bool(explicit.decoder) == model.frame.has_pose
     if explicit.decoder:
         scale = np.asarray(space().increment_scale)
         np.testing.assert_allclose(
@@ -209,7 +209,7 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
     build = partial(models.sfkd, scales, **TINY | VARIANTS[name])
     model, both = build(), build(planning_residual=True)
     planning, params = both.planning, jit(both.init)(jax.random.key(0))
-    draw, along = partial(jax.random.normal, jax.random.key(1)), both.along_path
+    draw, along = partial(jax.random.normal, jax.random.key(1)), not both.frame.has_pose
     states, controls = draw((3, 6)).at[:, 5].add(10.0), 0.01 * draw((2, 2 + 2 * along))
     if along:
         # e_y, e_ψ and ν are 0 in the first state, and v is v_ref: F is its tangent.
@@ -220,7 +220,7 @@ def test_what_planners_add_is_nothing_at_first_and_never_certified(name):
     @jit
     def driven(params):
         fiber = planning.fiber(params, run.envs[0])
-        there = planning.on_road(fiber, run.controls[0, 2:]) if along else fiber
+        there = planning.on_reference(fiber, run.controls[0, 2:]) if along else fiber
         start = planning.encode(fiber, run.states[0])
         after = (planning.step(at, start, controls[0]) for at in (there, fiber))
         steps = [planning.decode(fiber, latent) for latent in after]

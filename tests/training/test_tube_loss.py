@@ -10,6 +10,7 @@ from helpers import TINY, any_law, jit
 
 from sfkd_jax import models, plants
 from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.rollout import rollout
 from sfkd_jax.training import multi_step_loss
 from sfkd_jax.training._losses import power_mean
@@ -31,7 +32,7 @@ def learned():
     )
     space = measure_space(data)
     model = models.sfkd(
-        space, **TINY | {"frame": "path", "budget": "joint", "learn_alpha": True}
+        space, **TINY | {"frame": PATH_FRAME, "budget": "joint", "learn_alpha": True}
     )
     batch = random_windows(data.train, jax.random.key(2), batch=8, length=5)
     return model, space, jit(model.init)(jax.random.key(3)), batch
@@ -95,6 +96,6 @@ def test_a_power_mean_holds_tiny_and_huge_numbers():
 def test_a_tube_of_a_model_without_a_rate_is_refused(learned):
     space = learned[1]
     with pytest.raises(ValueError, match=r"training\.loss\.tube"):
-        multi_step_loss(models.neural_ode(space, frame="path"), space, tube=(0.1,))
+        multi_step_loss(models.neural_ode(space, frame=PATH_FRAME), space, tube=(0.1,))
     with pytest.raises(ValueError, match="4 weights, the body state 3 entries"):
         multi_step_loss(learned[0], space, tube=(0.1,) * 4)

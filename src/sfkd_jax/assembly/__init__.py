@@ -6,6 +6,7 @@ Every function takes an object of settings, or plain values that are parsed into
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, NamedTuple
 
@@ -40,6 +41,7 @@ from sfkd_jax.assembly._vehicles import build_driver as build_driver
 from sfkd_jax.assembly._vehicles import build_vehicle as build_vehicle
 from sfkd_jax.assembly._vehicles import takes_logs as takes_logs
 from sfkd_jax.certificate import Certificate
+from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -50,10 +52,12 @@ from sfkd_jax.settings import (
     schema,
     takes,
 )
-from sfkd_jax.types import Model, Space
+from sfkd_jax.types import BODY_FRAME, Model, Space
 
 MODELS = models.FACTORIES | {"own": models.own}
 """Factories of models by name; "own" is for a model from outside this package."""
+FRAMES = {frame.name: frame for frame in (BODY_FRAME, PATH_FRAME)}
+"""Coordinates in which models are learned, by name."""
 LAW_MODELS = ("learned", "nominal", "plant", *control.TEXTBOOK)
 """The models that a law of path coordinates may be derived from."""
 LAWS_ALONE = {f"law_{model}": model for model in LAW_MODELS}
@@ -114,10 +118,25 @@ class ModelSettings:
         return choose(MODEL_SETTINGS, values.get("name"), "model")
 
 
-MODEL_SETTINGS = {
-    name: schema("Model", ModelSettings, factory, skip=("dt", "nominal"))
-    for name, factory in MODELS.items()
-}
+@takes()
+class FramedModelSettings(ModelSettings):
+    """A model that can be learned in several coordinates.
+
+    Attributes:
+        frame: name of the coordinates, see `types.Frame`.
+    """
+
+    frame: Annotated[str, OneOf(FRAMES)] = "body"
+
+
+def _schema(factory: Callable[..., Model]) -> type[ModelSettings]:
+    """Return the settings of models of a factory."""
+    framed = "frame" in inspect.signature(factory).parameters
+    base = FramedModelSettings if framed else ModelSettings
+    return schema("Model", base, factory, skip=("dt", "nominal"))
+
+
+MODEL_SETTINGS = {name: _schema(factory) for name, factory in MODELS.items()}
 
 
 def build_model(
@@ -130,11 +149,13 @@ def build_model(
     """
     settings = parse(ModelSettings, settings, "model.")
     factory = MODELS[settings.name]
-    known = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    known: dict[str, Any] = {"dt": plant.dt, "nominal": plant.nominal_derivative}
+    if isinstance(settings, FramedModelSettings):
+        known["frame"] = FRAMES[settings.frame]
     # By signature: a factory takes what prior knowledge it names, and no more.
     parameters = inspect.signature(factory).parameters
     prior = {name: value for name, value in known.items() if name in parameters}
-    return factory(space, **prior, **arguments(settings, factory))
+    return factory(space, **arguments(settings, factory) | prior)
 
 
 def space_from_settings(settings: Values) -> Space:
@@ -194,7 +215,7 @@ def reference_systems(
     """
     if law is not None:
         plant = build_loop(plant, law)
-    physics = partial(models.physics, along_path=law is not None)
+    physics = partial(models.physics, frame=PATH_FRAME if law else BODY_FRAME)
     oracle = System(physics(plant.step), {}, "measured", law=law)
     nominal = System(physics(plant.nominal), {}, "none", law=law)
     systems = {"nominal": nominal, "oracle": oracle}

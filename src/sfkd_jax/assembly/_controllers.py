@@ -14,7 +14,13 @@ from sfkd_jax.assembly._controller_settings import (
 )
 from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
 from sfkd_jax.certificate import Certificate
-from sfkd_jax.geometry import CURVATURE, HEADING, PATH_SPEED, REFERENCE_SPEED
+from sfkd_jax.geometry import (
+    CURVATURE,
+    HEADING,
+    PATH_FRAME,
+    PATH_SPEED,
+    REFERENCE_SPEED,
+)
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
 from sfkd_jax.types import Controller, Model
@@ -88,7 +94,7 @@ def build_controller(
     adaptive = adaptive or estimates_env
     if isinstance(settings, SearchSettings):
         adaptive = adaptive or settings.adaptive
-    if not model.along_path:
+    if model.frame is not PATH_FRAME:
         if adaptive:
             raise ValueError(
                 "adaptation and environment.source=estimated need a model "

@@ -23,7 +23,7 @@ from sfkd_jax.certification._claims import (
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
 from sfkd_jax.rollout import fold, on_host
-from sfkd_jax.types import POSE, Key, Model, Params
+from sfkd_jax.types import BODY, POSE, Frame, Key, Model, Params
 
 PAIRS = 256
 """Number of random pairs (e, e') between which the transport is differentiated."""
@@ -155,10 +155,8 @@ def attack_model(
 
     "step" is the largest ||∂(T(e → e') F(z, u, e))/∂z||_2 with F = `model.step` and
     T = `model.transport`. "transport" is the largest slope of T alone, over random
-    pairs (e, e'). The others are slopes of outputs. Along a path these are "position"
-    (e_y [m]), "yaw" (e_ψ [rad]) and "body", the body state, all decoded from z.
-    Otherwise they are the pose increment of a step and that of decoding, "position"
-    [m], "yaw" [rad] and "decoder" (both), and "body".
+    pairs (e, e'). The others are slopes of the outputs of the frame, and, if it
+    has a pose, "decoder" of the whole pose increment.
 
     e and e' stay in the box. z and u are free, as in the certificate.
 
@@ -202,13 +200,13 @@ def attack_model(
     )
     transports = jax.jit(jax.vmap(transport_jacobian, in_axes=(None, 0)))(params, pairs)
     jacobians = steepest(outputs, key=output_key, iterations=60)
-    reached = _norms_of_outputs(jacobians, model.along_path)
+    reached = _norms_of_outputs(jacobians, model.frame)
     reached["transport"] = _largest_norm(np.asarray(transports, dtype=np.float64))
     reached["step"] = _largest_norm(steepest(step, key=step_key, iterations=120))
     return reached
 
 
-def _norms_of_outputs(jacobians: list[Matrix], along_path: bool) -> dict[str, float]:
+def _norms_of_outputs(jacobians: list[Matrix], frame: Frame) -> dict[str, float]:
     """Return the largest norms of the slopes of outputs, by name.
 
     These are exact norms. An ascent itself knows a slope along one direction alone.
@@ -217,23 +215,17 @@ def _norms_of_outputs(jacobians: list[Matrix], along_path: bool) -> dict[str, fl
         jacobians: at the end of each ascent. Rows 0 to 2 are the pose after a step,
             rows 3 to 5 that of decoding, which is constant unless the pose is part of
             z. The rows after them decode the body.
-        along_path: whether the body is ξ, that is e_y, e_ψ, and the vehicle's body.
+        frame: of the model.
     """
-    if along_path:
-        return {
-            "position": _largest_norm(jacobians, slice(6, 7)),
-            "yaw": _largest_norm(jacobians, slice(7, 8)),
-            "body": _largest_norm(jacobians, slice(8, None)),
-        }
-    poses = []
+    states = []
     for jacobian in jacobians:
-        poses += [jacobian[:3], jacobian[3:6]]
-    return {
-        "position": _largest_norm(poses, slice(0, 2)),
-        "yaw": _largest_norm(poses, slice(2, 3)),
-        "decoder": _largest_norm(poses, slice(0, 3)),
-        "body": _largest_norm(jacobians, slice(6, None)),
-    }
+        # Decoded, and with the pose after a step in place of the decoded one.
+        decoded = jacobian[3:]
+        states += [decoded, np.concatenate([jacobian[:3], decoded[BODY]])]
+    norms = {name: _largest_norm(states, rows) for name, rows in frame.outputs.items()}
+    if frame.has_pose:
+        norms["decoder"] = _largest_norm(states, POSE)
+    return norms
 
 
 def _largest_norm(jacobians: Any, rows: slice = slice(None)) -> float:

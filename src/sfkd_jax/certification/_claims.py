@@ -145,8 +145,8 @@ def hull_scope(weights: Exported) -> str:
 def readouts(weights: Exported) -> dict[str, Matrix]:
     """Return the rows of the linear read-out by the names of the outputs.
 
-    If a decoder gives the pose, the read-out gives the body state alone. Along a path
-    it gives e_y [m], e_ψ [rad], and the rest of the body state.
+    If a decoder gives the pose, the read-out gives the body state alone. Without a pose
+    it gives the outputs "position" and "yaw", and the rest of the body state.
     """
     rows = weights.readout
     if weights.decoder:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.special import betaincinv
 
 from sfkd_jax.certificate import Coverage
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
+from sfkd_jax.geometry import between
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 
@@ -34,8 +34,7 @@ class Residuals(NamedTuple):
 
     Attributes:
         gaps: d_k in latent coordinates.
-        outputs: 2-norms of the errors of position [m], yaw [rad] and body state. Along
-            a path these are e_y [m], e_ψ [rad] and the body state of the vehicle.
+        outputs: 2-norms of the errors of the outputs of the frame, see `Frame.outputs`.
     """
 
     gaps: Float[np.ndarray, "run time rank"]
@@ -79,22 +78,18 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
         predictions = rollout(model, params, run)
         before = run.states[:-1]
         after = run.states[1:]
-        body = (predictions.single - after)[:, BODY]
-        if model.along_path:
-            # The outputs of path states are in the body. They have no pose.
-            outputs = (
-                body[:, LATERAL, None],
-                body[:, HEADING, None],
-                body[:, PATH_SPEED:],
-            )
-        else:
+        errors = predictions.single - after
+        if model.frame.has_pose:
             # Poses are compared as motions of one step. Each turns far less than π, so
             # that the difference of the yaw needs no wrap.
             motion_of = jax.vmap(between)
             motion = motion_of(before[:, POSE], predictions.single[:, POSE])
             motion -= motion_of(before[:, POSE], after[:, POSE])
-            outputs = (motion[:, :2], motion[:, 2:], body)
-        norms = [jnp.linalg.norm(output, axis=1) for output in outputs]
+            errors = jnp.concatenate([motion, errors[:, BODY]], axis=1)
+        norms = [
+            jnp.linalg.norm(errors[:, entries], axis=1)
+            for entries in model.frame.outputs.values()
+        ]
         return predictions.defects, jnp.stack(norms, 1)
 
     return jax.vmap(errors_of_run)(runs)

@@ -73,7 +73,7 @@ def measure(
         lipschitz=proof.lipschitz,
         one_step=d_bar.one_step,
         horizon=horizon,
-        largest_increment=None if model.along_path else _longest_step(calibration),
+        largest_increment=_longest_step(calibration) if model.frame.has_pose else None,
     )
     return Measured(boxes=boxes, d_bar=d_bar, tube=tube, outputs=outputs)
 

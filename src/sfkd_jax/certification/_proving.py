@@ -86,7 +86,7 @@ def prove(
     outputs = {}
     if validation is not None:
         lyapunov, refused = _lyapunov(larger)
-        if model.along_path and keeps_metrics(larger):
+        if not model.frame.has_pose and keeps_metrics(larger):
             outputs = _metrics_of_outputs(model, params, larger, lyapunov, validation)
     return Proof(
         **vars(claims),
@@ -124,8 +124,7 @@ def _metrics_of_outputs(
 ) -> dict[str, OutputMetric]:
     """Return a metric for each of `OUTPUTS`.
 
-    There is none if there is no metric for one of them, because a corridor needs both
-    position and heading.
+    There is none if there is no metric for one of them, because a corridor needs all.
     """
     gaps = worst_gaps(residuals(model, fold(model, params, on_host), validation))
     start = None if lyapunov is None else np.asarray(lyapunov.metric)

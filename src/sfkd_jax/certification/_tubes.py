@@ -68,7 +68,7 @@ def tubes(
     """Return the tubes of a certificate, for predictions that start at the true z_0.
 
     They are the radii R_1 … R_T of `latent_tube`, those of the outputs, and their
-    limits. Along a path all outputs are decoded from z, so that no error accumulates:
+    limits. Without a pose all outputs are decoded from z, so that no error accumulates:
 
         |e_i,k| ≤ L_i α R_{k−1} + ε_i,   k = 1 … T
 
@@ -83,7 +83,7 @@ def tubes(
         lipschitz: L of the outputs, by "position", "yaw", "body".
         one_step: measured bounds at the true latent: d̄, and ε of the outputs.
         horizon: T [steps].
-        largest_increment: |dp|, the longest step [m]; None along a path.
+        largest_increment: |dp|, the longest step [m]; None without a pose.
     """
     latent = latent_tube(alpha, one_step.latent, horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
@@ -115,7 +115,7 @@ def tubes(
 
 
 FORMS = ("asymptotic", "vehicle_to_nominal")
-"""Two bounds on |y_k − ŷ_k| of vehicle and nominal model over a whole run. The first
+"""Two bounds on |y_k − ŷ_k| of system and nominal model over a whole run. The first
 follows from the largest disturbance alone, the second from the sequence of all
 disturbances.
 """
@@ -138,7 +138,7 @@ def radii(
         measured: errors of every step of the runs.
         name: of the output.
         claim: proved constants of the output.
-        start: z_0 − ẑ_0; None if the nominal model starts at the state of the car.
+        start: z_0 − ẑ_0; None if the nominal model starts at the state of the system.
     """
     # |d|_P is the 2-norm of d'L with P = L L'.
     factor = np.linalg.cholesky(np.asarray(claim.metric))

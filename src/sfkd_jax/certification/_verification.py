@@ -71,9 +71,9 @@ def _require_what_follows(certificate: Certificate, trained: Trained) -> None:
         horizon=len(stated.latent),
         largest_increment=stated.largest_increment_m,
     )
-    along_path = trained.model.along_path
+    has_pose = trained.model.frame.has_pose
     require(
-        (stated.largest_increment_m is None) == along_path
+        (stated.largest_increment_m is not None) == has_pose
         and _near(vars(stated), vars(derived), REPEATED),
         "measured.tube does not follow from the proof and d_bar",
     )

@@ -3,8 +3,8 @@
 from sfkd_jax.evaluation._loops import Episode as Episode
 from sfkd_jax.evaluation._loops import disturbed_environment as disturbed_environment
 from sfkd_jax.evaluation._loops import observed_environment as observed_environment
-from sfkd_jax.evaluation._loops import open_loop as open_loop
 from sfkd_jax.evaluation._loops import simulate as simulate
+from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._rows import SHARED as SHARED
 from sfkd_jax.evaluation._rows import Scores as Scores
 from sfkd_jax.evaluation._rows import compare as compare

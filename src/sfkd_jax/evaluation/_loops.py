@@ -12,17 +12,13 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
 from sfkd_jax.geometry import (
-    HEADING,
     LATERAL,
-    PATH_SPEED,
     curvature_ahead,
     path_coordinates,
-    wrap_angle,
 )
 from sfkd_jax.info import reported
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
-from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors
 from sfkd_jax.scenarios import (
     Scenario,
     car_clearance,
@@ -32,15 +28,12 @@ from sfkd_jax.scenarios import (
     reference_window,
 )
 from sfkd_jax.types import (
-    BODY,
     Controller,
     Key,
-    Model,
     Params,
     Scalar,
     State,
     Step,
-    Trajectory,
 )
 
 FORCE_STREAM = 2
@@ -230,39 +223,3 @@ def disturbed_environment(
     # Plants have no other input from the side than wind.
     wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
     return envs.at[:, 1].set(wind(envs[:, 1], force))
-
-
-def open_loop(
-    model: Model, params: Params, trajectories: Trajectory, *, horizon: int
-) -> Float[Array, "horizon column"]:
-    """Return the RMSE of free-running predictions 1 … horizon steps ahead.
-
-    Predictions start at every `horizon`-th step of each trajectory.
-
-    The columns are the errors along and across the true heading [m], so that each axis
-    means the same on every trajectory, of the yaw [rad] and of the body state. In path
-    coordinates they are 0 and the errors of e_y [m], e_ψ [rad] and the body state.
-
-    Args:
-        model: that predicts.
-        params: of the model.
-        trajectories: held out from training.
-        horizon: length of a prediction [steps].
-    """
-    windows = adjacent_windows(trajectories, length=horizon)
-
-    def squared_errors(window: Trajectory) -> Float[Array, "horizon column"]:
-        predicted = rollout(model, params, window).free
-        true = window.states[1:]
-        if not model.along_path:
-            return state_errors(predicted, true) ** 2
-        error = (predicted - true)[:, BODY]
-        # A model in path coordinates does not predict the position along the path.
-        along = jnp.zeros(error.shape[0])
-        lateral = error[:, LATERAL]
-        heading = wrap_angle(error[:, HEADING])
-        body = error[:, PATH_SPEED:]
-        return jnp.column_stack([along, lateral, heading, body]) ** 2
-
-    squares = in_batches(jax.vmap(squared_errors), windows, size=128)
-    return jnp.sqrt(jnp.mean(squares, axis=0))

@@ -26,7 +26,7 @@ from sfkd_jax.ranges import in_words
 from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.settings import arguments
 from sfkd_jax.training import Loss, descend, fit, multi_step_loss, planning_loss
-from sfkd_jax.types import Key, Model, Params, Space, Trajectory
+from sfkd_jax.types import Frame, Key, Model, Params, Space, Trajectory
 
 SCORED_SCENARIOS = ("uniform", "wet")
 """Scenarios of the validation runs that trainings are compared on: S3 stays unseen."""
@@ -172,9 +172,7 @@ def _open_loop_document(
     # Controls along a path are perturbations of a law, which is not linear.
     if not is_along_path:
         steps["least_squares"] = identified.least_squares(dataset)
-    baselines = {
-        name: physics(step, along_path=is_along_path) for name, step in steps.items()
-    }
+    baselines = {name: physics(step, frame=model.frame) for name, step in steps.items()}
 
     @jax.jit
     def errors(params: Params, test: Trajectory) -> tuple[jax.Array, dict[str, Any]]:
@@ -186,28 +184,32 @@ def _open_loop_document(
         return of_model, of_baselines
 
     of_model, of_baselines = errors(fold(model, params, on_host), dataset.test)
-    # Of ξ, as `control.Adaptation.model_error` takes them, or of all states.
-    first_coordinate = 1 if is_along_path else 0
-    one_step = np.asarray(of_model, np.float64)[0, first_coordinate:]
+    one_step = np.asarray(of_model, np.float64)[0]
     return {
         "steps": list(range(1, horizon + 1)),
         "dt": plant.dt,
         "trajectories": dataset.test.controls.shape[0],
-        **_error_columns(of_model),
+        **_error_columns(model.frame, of_model),
         "one_step_rmse": one_step.tolist(),
         "baselines": {
-            name: _error_columns(errors) for name, errors in of_baselines.items()
+            name: _error_columns(model.frame, errors)
+            for name, errors in of_baselines.items()
         },
     }
 
 
-def _error_columns(errors: jax.Array) -> dict[str, list[float]]:
+def _error_columns(frame: Frame, errors: jax.Array) -> dict[str, list[float]]:
     """Return errors by coordinate as lists over the steps ahead.
 
     Args:
-        errors: RMS errors along, across, of yaw and of the body state, (step, state).
+        frame: of the model.
+        errors: of `open_loop`.
     """
-    longitudinal, lateral, yaw, speed, *_ = np.asarray(errors, dtype=np.float64).T
+    columns = np.asarray(errors, dtype=np.float64)
+    if not frame.has_pose:
+        # A model in path coordinates does not predict the position along the path.
+        columns = np.pad(columns, ((0, 0), (1, 0)))
+    longitudinal, lateral, yaw, speed, *_ = columns.T
     return {
         "position_rmse_m": np.hypot(longitudinal, lateral).tolist(),
         "longitudinal_rmse_m": longitudinal.tolist(),

@@ -59,7 +59,7 @@ def check_settings(run: Run) -> None:
     for name in settings.evaluation.systems:
         choose(dict.fromkeys(systems), name, "evaluation.systems entry")
     model = assembly.build_model(settings.model, _unit_space(sizes), plant)
-    if model.along_path != (law is not None):
+    if model.frame.has_pose == (law is not None):
         raise ValueError(
             "model.frame=path and dataset=path go together: "
             "path coordinates for both or for neither"

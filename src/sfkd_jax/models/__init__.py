@@ -26,6 +26,6 @@ FACTORIES = {
 
 `space` holds measured scales, which fix all sizes. Several models have these settings:
 `dt` is the sampling period and the solver's step [s]. `environment` is whether e is
-used; if not, e is 0. `frame` is "body", or "path" for path coordinates, which have no
-pose.
+used; if not, e is 0. `frame` is a `types.Frame`, the
+coordinates of states.
 """

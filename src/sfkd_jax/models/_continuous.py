@@ -12,14 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import rotate
-from sfkd_jax.models._networks import FRAMES
 from sfkd_jax.models._state_model import state_model
-from sfkd_jax.ranges import check_choice
 from sfkd_jax.rollout import runge_kutta
 from sfkd_jax.types import (
+    BODY_FRAME,
     Control,
     Environment,
     Fiber,
+    Frame,
     Key,
     Model,
     Params,
@@ -58,7 +58,7 @@ def continuous(
     environment: bool = True,
     solve: Callable[[Callable[[State], State], State, float], State] = runge_kutta,
     known: Callable[[Fiber, State, Control], State] | None = None,
-    frame: str = "body",
+    frame: Frame = BODY_FRAME,
 ) -> Model:
     """Return a model with learned rates and one solver step per sampling period.
 
@@ -66,7 +66,7 @@ def continuous(
 
     The latent is the state itself. s and u are scaled. m_g and S_g are centre and scale
     of the pose increment over dt, and S_s is the scale of s. u and e are held over dt.
-    R turns the velocity along and across the car into the world frame, so the model is
+    R turns the velocity along and across the body into the world frame, so the model is
     equivariant under SE(2).
 
     Args:
@@ -78,11 +78,8 @@ def continuous(
         known: (fiber, state, control) -> known dx/dt in the world frame and physical
             units, equivariant under SE(2). The rates are added to it, and m_g is
             omitted.
-        frame: "body", or "path" for path coordinates, which have no pose; r_g is then
-            ignored.
+        frame: the coordinates of states. Without a pose r_g is ignored.
     """
-    check_choice("model.frame", frame, FRAMES)
-    has_pose = frame == "body"
     # Known dynamics include the mean motion; learned rates start from that of the data.
     drift = jnp.asarray(space.increment_mean) if known is None else jnp.zeros(3)
 
@@ -91,8 +88,8 @@ def continuous(
 
     def derivative(fiber: Fiber, control: Control, state: State) -> State:
         rate = rates.at(fiber, space.scaled_body(state), space.scaled_control(control))
-        # The first three entries of a path state are no pose, and stay 0.
-        if not has_pose:
+        # Without a pose the first three entries stay 0.
+        if not frame.has_pose:
             return jnp.concatenate([jnp.zeros(3), space.body_scale * rate[3:]])
         # Increments over dt are the units in which the data are of size 1.
         twist = (drift + space.increment_scale * rate[:3]) / dt
@@ -114,7 +111,7 @@ def continuous(
         step,
         vector=space.scaled_body,
         state_size=3 + space.body_mean.shape[0],
-        along_path=not has_pose,
+        frame=frame,
     )
 
 
@@ -147,7 +144,7 @@ def neural_ode(
     dt: float = 0.1,
     hidden: tuple[int, ...] = (96, 96),
     environment: bool = True,
-    frame: str = "body",
+    frame: Frame = BODY_FRAME,
 ) -> Model:
     """Rates of the body state and the pose from one tanh network, solved by RK4 at dt.
 
@@ -157,7 +154,7 @@ def neural_ode(
 
     Args:
         hidden: widths of the network.
-        frame: "body", or "path" for path coordinates.
+        frame: the coordinates of states.
 
     Source: Chen et al., NeurIPS 2018, arXiv 1806.07366.
     """

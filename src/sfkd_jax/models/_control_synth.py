@@ -11,7 +11,16 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.models._continuous import Rates, continuous, mlp
 from sfkd_jax.ranges import Positive
-from sfkd_jax.types import Control, Environment, Key, Model, Params, Space
+from sfkd_jax.types import (
+    BODY_FRAME,
+    Control,
+    Environment,
+    Frame,
+    Key,
+    Model,
+    Params,
+    Space,
+)
 
 GAIN = 0.3
 """Initial size of the networks of the state. Their decay is GAIN² per second, which is
@@ -67,7 +76,7 @@ def control_synth(
     rate: Positive = 0.05,
     input_hidden: tuple[int, ...] = (96, 96),
     environment: bool = True,
-    frame: str = "body",
+    frame: Frame = BODY_FRAME,
 ) -> Model:
     """Networks of the state plus a network of the input, with a contraction rate.
 
@@ -96,7 +105,7 @@ def control_synth(
         width: of each network.
         rate: γ [1/s].
         input_hidden: widths of the network that holds g and h.
-        frame: "body", or "path" for path coordinates.
+        frame: the coordinates of states.
 
     Source: Mei, Zheng and Li, NeurIPS 2024, arXiv 2411.02292.
     """

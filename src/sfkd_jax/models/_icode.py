@@ -12,7 +12,17 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.models._continuous import Conditioned, Rates, continuous, mlp
 from sfkd_jax.ranges import check_choice
-from sfkd_jax.types import Control, Key, Model, Params, Space, State, Step
+from sfkd_jax.types import (
+    BODY_FRAME,
+    Control,
+    Frame,
+    Key,
+    Model,
+    Params,
+    Space,
+    State,
+    Step,
+)
 
 AFFINE_IN = ("both", "env", "control")
 
@@ -80,7 +90,7 @@ def icode(
     layers: int = 3,
     environment: bool = True,
     affine_in: str = "both",
-    frame: str = "body",
+    frame: Frame = BODY_FRAME,
 ) -> Model:
     """Input concomitant neural ODE: rates affine in control and environment.
 
@@ -97,7 +107,7 @@ def icode(
         layers: number of hidden layers of f and of G.
         affine_in: "both" as above; "env" for f(s, u) + G(s, u) e, where e is what the
             paper calls an extrinsic input; "control" for f(s, e) + G(s, e) u.
-        frame: "body", or "path" for path coordinates.
+        frame: the coordinates of states.
 
     Source: Li et al., arXiv 2411.13914.
     """

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import PATH_SPEED, PathState, compose, path_state
+from sfkd_jax.geometry import compose, path_state
 from sfkd_jax.models._state_model import state_model
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import (
@@ -28,15 +28,16 @@ from sfkd_jax.types import (
 )
 
 FREE = 2
-"""Number of entries of a control that differ between samples; along a path κ and v_ref
-follow them.
+"""Number of entries of a control that differ between samples; the inputs ρ from the
+reference follow them.
 """
 HIDDEN = 64
-"""Hidden width of g in the frame of the car; along a known road half is enough."""
+"""Hidden width of g without a reference; around a known one half is enough."""
 WIDTH = 64
 """Width of the network that gives the weights of g."""
 SCALE = 0.005
 """Factor of M, N, m and V, because g is small."""
+BodyState: TypeAlias = Float[Array, " body"]
 
 
 class Residual(NamedTuple):
@@ -70,7 +71,7 @@ class PlanningFiber(NamedTuple):
 
     Attributes:
         certified: of F.
-        residual: g; along a path, before the road is known, weights and scaled e that
+        residual: g; if it depends on ρ, before ρ is known, weights and scaled e that
             determine it.
     """
 
@@ -84,10 +85,9 @@ class Planning:
 
         x⁺ = D F(Φ(x), u; e) + g,   g = M s + N ν + m + V tanh(W s + U ν + c)
 
-    The model returns to the state at every step. A network of e, and along a path of κ
-    and v_ref as well, gives M to c, which all samples of a plan share. Along a path
-    they also share F, linearised at a car on the path, so one small layer is left for
-    each sample.
+    The model returns to the state at every step. A network of e and ρ gives M to c,
+    which all samples of a plan share. In a frame with a reference they also share F,
+    linearised at a system that follows it, so one small layer is left for each sample.
 
     Attributes:
         certified: F.
@@ -102,14 +102,13 @@ class Planning:
     @property
     def _hidden(self) -> int:
         """Hidden width of g."""
-        return HIDDEN // 2 if self.certified.along_path else HIDDEN
+        return HIDDEN // 2 if self.certified.frame.inputs else HIDDEN
 
     @property
     def _sizes(self) -> tuple[int, list[int]]:
         """Number of inputs of g, and the ends of its parts in the network's outputs."""
         body = self.space.body_mean.shape[0]
-        # Along a path there is no pose: that of the start stays.
-        pose = 0 if self.certified.along_path else 3
+        pose = 3 if self.certified.frame.has_pose else 0
         inputs = body + FREE
         outputs = body + pose
         affine = outputs * (inputs + 1)
@@ -118,7 +117,7 @@ class Planning:
 
     @property
     def _network(self) -> nn.Sequential:
-        """The network of e and the road. Its initial g is 0."""
+        """The network of ρ and e. Its initial g is 0."""
         inputs, (affine_end, hidden_end, size) = self._sizes
 
         def start(key: Key, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
@@ -133,8 +132,7 @@ class Planning:
 
     def init(self, key: Key) -> Params:
         """Draw parameters of F, and those of g as its entry "planning"."""
-        road = self.space.control_mean[FREE:].shape[0]
-        inputs = jnp.zeros(road + self.space.env_mean.shape[0])
+        inputs = jnp.zeros(self.certified.frame.inputs + self.space.env_mean.shape[0])
         # From another key, so that the parameters of F are those without g.
         planning = self._network.init(jax.random.fold_in(key, 2), inputs)["params"]
         return {**self.certified.init(key), "planning": planning}
@@ -143,17 +141,17 @@ class Planning:
         """Return the fiber of F and g, see `PlanningFiber`."""
         scaled = self.space.scaled_env(env, self.environment)
         weights = unfold(params)["planning"]
-        if self.certified.along_path:
+        if self.certified.frame.inputs:
             residual = (weights, scaled)
         else:
             residual = self._residual(weights, scaled)
         return PlanningFiber(self.certified.fiber(params, env), residual)
 
     def step(self, fiber: PlanningFiber, state: State, control: Control) -> State:
-        """Advance the state, or (ξ, 1) along a path, by one sampling period."""
+        """Advance the state, or (s, 1) around a reference, by one sampling period."""
         nu = control[:FREE]
         g = fiber.residual
-        if not self.certified.along_path:
+        if not self.certified.frame.inputs:
             after = self._certified(fiber, state, control)
             added = g(jnp.append(state[BODY], 1.0), nu)
             pose = compose(after[POSE], added[POSE])
@@ -162,22 +160,22 @@ class Planning:
             return g(state, nu)
         # For a single step, a product with the derivative is less work than the
         # derivative itself.
-        road = control[FREE:]
-        certified, at = self._on_path(fiber, road)
+        rho = control[FREE:]
+        certified, at = self._on_reference(fiber, rho)
         before, change = jax.jvp(certified, at, (state[:-1] - at[0], nu))
         weights, env = g
-        added = self._residual(weights, env, road)(state, nu)
+        added = self._residual(weights, env, rho)(state, nu)
         return jnp.append(before + change + added, 1.0)
 
-    def on_road(self, fiber: PlanningFiber, road: Control) -> PlanningFiber:
-        """Return the fiber of steps on a road, with F in the affine part of g."""
-        certified, at = self._on_path(fiber, road)
+    def on_reference(self, fiber: PlanningFiber, rho: Control) -> PlanningFiber:
+        """Return the fiber of steps with inputs ρ, with F in the affine part of g."""
+        certified, at = self._on_reference(fiber, rho)
         weights, env = fiber.residual
         A, B = jax.jacfwd(certified, (0, 1))(*at)
         offset = certified(*at) - A @ at[0]
-        g = self._residual(weights, env, road)
+        g = self._residual(weights, env, rho)
         size = A.shape[0]
-        # One more row keeps the last entry of (ξ, 1) at 1.
+        # One more row keeps the last entry of (s, 1) at 1.
         last_row = jnp.eye(size + 1)[-1:]
         affine = jnp.column_stack([A, offset]) + g.of_state[:size]
         residual = Residual(
@@ -189,28 +187,28 @@ class Planning:
         )
         return fiber._replace(residual=residual)
 
-    def _on_path(self, fiber: PlanningFiber, road: Control) -> tuple[Any, Any]:
-        """Return F on a road as (ξ, ν) ↦ ξ⁺, and the ξ and ν of a car on the path."""
+    def _on_reference(self, fiber: PlanningFiber, rho: Control) -> tuple[Any, Any]:
+        """Return F at ρ as (s, ν) ↦ s⁺, and s and ν of a system on its reference."""
 
-        def certified(xi: PathState, nu: Control) -> PathState:
-            return self._certified(fiber, path_state(xi), jnp.append(nu, road))[BODY]
+        def certified(body: BodyState, nu: Control) -> BodyState:
+            return self._certified(fiber, path_state(body), jnp.append(nu, rho))[BODY]
 
-        xi = jnp.zeros(self.space.body_mean.shape[0]).at[PATH_SPEED].set(road[1])
-        return certified, (xi, jnp.zeros(FREE))
+        size = self.space.body_mean.shape[0]
+        return certified, (self.certified.frame.following(rho, size), jnp.zeros(FREE))
 
     def model(self) -> Model:
         """Return F, in place of which planners roll out F + g."""
         size = 3 + self.space.body_mean.shape[0]
         F = self.certified
         planning = state_model(self.init, self.fiber, self.step, state_size=size)
-        planning = planning._replace(shared=F.shared, along_path=F.along_path)
-        if F.along_path:
+        planning = planning._replace(shared=F.shared, frame=F.frame)
+        if F.frame.inputs:
             planning = planning._replace(
-                encode=_encode_path,
-                decode=_decode_path,
-                observe=_observe_path,
-                vector=_path_vector,
-                on_road=self.on_road,
+                encode=_encode,
+                decode=_decode,
+                observe=_observe,
+                vector=_vector,
+                on_reference=self.on_reference,
             )
         return F._replace(init=self.init, planning=planning)
 
@@ -221,22 +219,22 @@ class Planning:
         return F.decode(fiber.certified, F.step(fiber.certified, latent, control))
 
     def _residual(
-        self, weights: Params, env: Environment, road: Control | None = None
+        self, weights: Params, env: Environment, rho: Control | None = None
     ) -> Residual:
         """Return g in the units of states and controls.
 
         Args:
             weights: of the network.
             env: scaled e.
-            road: κ [1/m] and v_ref [m/s]; None in the frame of the car.
+            rho: inputs from the reference; None in a frame without them.
         """
         space = self.space
         inputs, ends = self._sizes
         network_inputs = env
-        if road is not None:
+        if rho is not None:
             mean = space.control_mean[FREE:]
             scale = space.control_scale[FREE:]
-            network_inputs = jnp.append((road - mean) / scale, env)
+            network_inputs = jnp.append((rho - mean) / scale, env)
         outputs = self._network.apply({"params": weights}, network_inputs)
         affine, hidden, last = jnp.split(cast(Array, outputs), ends[:-1])
         affine = affine.reshape(-1, inputs + 1)
@@ -244,7 +242,7 @@ class Planning:
         mean = jnp.append(space.body_mean, space.control_mean[:FREE])
         scale = jnp.append(space.body_scale, space.control_scale[:FREE])
         units = jnp.asarray(space.body_scale)
-        if not self.certified.along_path:
+        if self.certified.frame.has_pose:
             units = jnp.append(space.increment_scale, units)
         units = SCALE * units[:, None]
         # The inputs of g are in physical units, so that a rollout scales none.
@@ -259,23 +257,23 @@ class Planning:
         )
 
 
-def _encode_path(fiber: PlanningFiber, state: State) -> Float[Array, " _"]:
-    """Return (ξ, 1)."""
+def _encode(fiber: PlanningFiber, state: State) -> Float[Array, " _"]:
+    """Return (s, 1)."""
     return jnp.append(state[BODY], 1.0)
 
 
-def _decode_path(fiber: PlanningFiber, latent: Float[Array, " _"]) -> State:
-    """Return the state of (ξ, 1)."""
+def _decode(fiber: PlanningFiber, latent: Float[Array, " _"]) -> State:
+    """Return the state of (s, 1)."""
     return path_state(latent[:-1])
 
 
-def _observe_path(
+def _observe(
     fiber: PlanningFiber, latent: Float[Array, " _"], state: State
 ) -> Float[Array, " _"]:
-    """Return (ξ, 1) of a state."""
-    return _encode_path(fiber, state)
+    """Return (s, 1) of a state."""
+    return _encode(fiber, state)
 
 
-def _path_vector(latent: Float[Array, " _"]) -> PathState:
-    """Return ξ."""
+def _vector(latent: Float[Array, " _"]) -> BodyState:
+    """Return s."""
     return latent[:-1]

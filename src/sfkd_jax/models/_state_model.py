@@ -10,9 +10,11 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.types import (
     BODY,
+    BODY_FRAME,
     Control,
     Environment,
     Fiber,
+    Frame,
     Key,
     Model,
     Params,
@@ -38,7 +40,7 @@ def state_model(
     *,
     vector: Callable[[State], Float[Array, " body"]] = body_state,
     state_size: int | None = None,
-    along_path: bool = False,
+    frame: Frame = BODY_FRAME,
 ) -> Model:
     """Return a model that steps the state itself, so that nothing is encoded.
 
@@ -50,7 +52,7 @@ def state_model(
             default those of the body.
         state_size: number of entries of a state, which is checked when a state is
             encoded; None accepts any.
-        along_path: whether states and controls are those of `geometry`.
+        frame: the coordinates of states, and the inputs of controls.
     """
 
     def encode(fiber: Fiber, state: State) -> State:
@@ -80,17 +82,17 @@ def state_model(
         transport=transport,
         observe=observe,
         vector=vector,
-        along_path=along_path,
+        frame=frame,
     )
 
 
-def physics(step: Step, *, along_path: bool = False) -> Model:
+def physics(step: Step, *, frame: Frame = BODY_FRAME) -> Model:
     """Return known dynamics as a `Model` without parameters.
 
     Args:
         step: (x, u, e) -> x one sampling period later. The caller passes it in, since
-            models never import the vehicle.
-        along_path: whether x and u are those of `geometry`.
+            models never import a plant.
+        frame: the coordinates of x, and the inputs of u.
     """
 
     def init(key: Key) -> Params:
@@ -103,7 +105,7 @@ def physics(step: Step, *, along_path: bool = False) -> Model:
     def step_in(env: Environment, state: State, control: Control) -> State:
         return step(state, control, env)
 
-    return state_model(init, fiber, step_in, along_path=along_path)
+    return state_model(init, fiber, step_in, frame=frame)
 
 
 def step_of(model: Model, params: Params) -> Step:

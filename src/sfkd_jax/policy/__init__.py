@@ -274,7 +274,7 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
 
     @wraps(controller.init)
     def init(key: Key) -> Any:
-        if trained.model.along_path and jax.debug_nans.value:
+        if not trained.model.frame.has_pose and jax.debug_nans.value:
             raise ValueError(
                 "jax_debug_nans: controllers along a path keep NaN for what is not "
                 "known yet; switch it off"

@@ -51,7 +51,8 @@ def describe(
     """
     vehicle = trained.vehicle
     interface = interface_of(trained, certificate)
-    frame = "along a path" if trained.model.along_path else "in the world"
+    has_pose = trained.model.frame.has_pose
+    frame = "in the world" if has_pose else "along a path"
     states = [state.label for state in vehicle.states]
     controls = in_words(
         [control["name"] for control in interface["controls"]],
@@ -78,8 +79,9 @@ def _certified_box(certificate: Certificate, trained: TrainedModel) -> str:
     """Return the line about the states for which the certificate is stated."""
     boxes = certificate.measured.boxes
     low, high = boxes.state
-    named = axes(trained.vehicle, along_path=trained.model.along_path)
-    if not trained.model.along_path:
+    has_pose = trained.model.frame.has_pose
+    named = axes(trained.vehicle, along_path=not has_pose)
+    if has_pose:
         return f"certified box: {in_words(named['state'], low, high)}"
     names = [*named["state"], *named["control"][2:]]
     # The first two inputs are ν, which is the planner's choice and has no condition.

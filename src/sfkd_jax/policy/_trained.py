@@ -117,9 +117,9 @@ def restore(path: str | Path) -> TrainedModel:
                 raise store.ArtefactError(f"{file}: weights {name} are not finite")
         tables = _take_law(arrays)
         assembly.check_consistent(
-            settings, vehicle, tables if model.along_path else None
+            settings, vehicle, tables if model.frame.inputs else None
         )
-        law = law_from_arrays(tables) if model.along_path else None
+        law = law_from_arrays(tables) if model.frame.inputs else None
     return TrainedModel(
         model=model,
         params=_as_params(file, arrays, shapes),

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
 from sfkd_jax.rollout import Folded, fold, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
@@ -39,10 +38,6 @@ class Loss(NamedTuple):
 
 GROWTH = 0.5
 """Default growth of the errors with the steps, see `multi_step_loss`."""
-YAW_LENGTH = 5.0
-"""Weight of 1 rad of yaw in the loss [m]: the distance driven in half a second at the
-benchmark's speed.
-"""
 
 
 def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
@@ -56,17 +51,12 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
 def error_units(model: Model, space: Space) -> Float[Array, " state"]:
     """Return factors that convert each of `state_errors` to metres.
 
-    The factor is 1 for the position, 5 m for a radian of yaw, and 0.2 m for the half
-    width of any other entry. Along a path, e_y and e_ψ are position and yaw. The other
-    entries do not affect the position directly, and their half widths count 0.05 m.
+    See `Frame.lengths` and `Frame.length`.
     """
-    if model.along_path:
-        # Yaw rate, slip and steering move the car along a path only in later steps.
-        others = 0.05 / jnp.asarray(space.body_scale)
-        others = others.at[LATERAL].set(1.0).at[HEADING].set(YAW_LENGTH)
-    else:
-        others = 0.2 / jnp.asarray(space.body_scale)
-    return jnp.concatenate([jnp.asarray([1.0, 1.0, YAW_LENGTH]), others])
+    frame = model.frame
+    first = jnp.asarray(frame.lengths)
+    units = frame.length / jnp.asarray(space.body_scale)
+    return jnp.concatenate([first, units[len(first) - BODY.start :]])
 
 
 def multi_step_loss(
@@ -90,7 +80,7 @@ def multi_step_loss(
     W measures position in units of 0.01 m at the first step. Errors grow about linearly
     with k. Divided by this growth, the near steps, on which a planner depends most,
     weigh as much as the far ones. The one-step term, in units of 0.001 m, includes what
-    the sums over a window hide, such as a slip of a lateral millimetre per step. The
+    the sums over a window hide, such as a sideslip of a millimetre per step. The
     last sum is about the infinite-horizon tube of a certificate. c_i is row i of the
     read-out, and q is the 8th power mean over the batch, in place of the quantile of a
     calibration.
@@ -169,7 +159,7 @@ def one_step_loss(model: Model) -> Loss:
 
     def error(params: Params, data: Trajectory) -> Scalar:
         after = rollout(model, params, data).single
-        # Errors and scale are in the frame of the car.
+        # Errors and scale are in the frame of the body.
         errors = state_errors(after, data.states[1:])
         return jnp.mean((errors / jax.lax.stop_gradient(params["scale"])) ** 2)
 
@@ -179,8 +169,8 @@ def one_step_loss(model: Model) -> Loss:
 def planning_loss(model: Model, params: Params, space: Space) -> Loss:
     """Return the mean square error of single steps of `model.planning` [mm²].
 
-    The parameters of the loss are the weights of the residual alone. Along a path z is
-    the state, so a rollout is right where its steps are.
+    The parameters of the loss are the weights of the residual alone. A rollout of
+    states is right where its steps are.
     """
     units = error_units(model, space) / 0.001
     # The certified weights are frozen, so they are folded once.

@@ -31,6 +31,7 @@ from sfkd_jax.control.tasks._task import (
 from sfkd_jax.geometry import (
     HEADING,
     LATERAL,
+    PATH_FRAME,
     PATH_SPEED,
     PathState,
     beside,
@@ -207,7 +208,7 @@ class FollowingLaw(LawTask):
     law: PathLaw
 
     def __post_init__(self) -> None:
-        if not self.model.along_path:
+        if self.model.frame is not PATH_FRAME:
             raise ValueError(
                 "controller.sampling=law needs a model in path coordinates: "
                 "model.frame=path"
@@ -235,8 +236,8 @@ class FollowingLaw(LawTask):
         latent = self.model.encode(fiber, path_state(xi))
         start = Sample(latent, xi, before)
         fibers = None
-        if self.model.on_road is not None:
-            fibers = jax.vmap(partial(self.model.on_road, fiber))(preview.road)
+        if self.model.on_reference is not None:
+            fibers = jax.vmap(partial(self.model.on_reference, fiber))(preview.road)
         return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
 
     def step(

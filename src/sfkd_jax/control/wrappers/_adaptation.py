@@ -27,7 +27,7 @@ from sfkd_jax.control.wrappers._estimator import (
     transition_matrix,
 )
 from sfkd_jax.control.wrappers._innovations import expected_coordinates
-from sfkd_jax.geometry import LATERAL, PATH_SPEED, PathState, path_state
+from sfkd_jax.geometry import LATERAL, PATH_FRAME, PATH_SPEED, PathState, path_state
 from sfkd_jax.info import AdaptationInfo, ControllerInfo, reported
 from sfkd_jax.ranges import (
     AtLeastTwo,
@@ -149,7 +149,7 @@ class Adaptation(Stateful):
     def __post_init__(self) -> None:
         low = self.env_low
         high = self.env_high
-        if not self.model.along_path:
+        if self.model.frame is not PATH_FRAME:
             raise ValueError("adaptation needs a model in path coordinates")
         symmetric = len(low) == len(high) == 2 and -low[WIND] == high[WIND] > 0
         if not symmetric:

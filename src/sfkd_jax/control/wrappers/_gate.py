@@ -139,7 +139,7 @@ class Gate(Stateful):
 
     Attributes:
         inner: controller along a path.
-        model: of the closed loop, with `along_path`.
+        model: of the closed loop, in path coordinates.
         law: around which the model was learned.
         dt: sampling period [s].
         conditions: where the model predicts.

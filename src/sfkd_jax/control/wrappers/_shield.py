@@ -26,7 +26,7 @@ from sfkd_jax.control.wrappers._conditions import ANYWHERE, Box, Conditions, che
 from sfkd_jax.control.wrappers._nominal import Comparison, NominalModel, ShieldState
 from sfkd_jax.control.wrappers._rolling import RollingCorridor
 from sfkd_jax.control.wrappers._safety_filter import FilterResult, safety_filter
-from sfkd_jax.geometry import HEADING, PATH_SPEED, PathState
+from sfkd_jax.geometry import HEADING, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
 from sfkd_jax.types import (
@@ -93,7 +93,7 @@ class Shield(Stateful):
 
     Attributes:
         inner: any controller along a path; its control is u.
-        model: of the closed loop, with `along_path`.
+        model: of the closed loop, in path coordinates.
         law: around which the model was learned.
         width: of the nominal corridor to each side [m].
         tube: bound of |e_y − ê_y| [m].
@@ -132,7 +132,7 @@ class Shield(Stateful):
     claimed: bool = True
 
     def __post_init__(self) -> None:
-        if not self.model.along_path:
+        if self.model.frame is not PATH_FRAME:
             raise ValueError(
                 "a shield needs a model in path coordinates: model.frame=path"
             )

@@ -22,6 +22,7 @@ from sfkd_jax.types import (
     Environment,
     Explicit,
     Fitting,
+    Frame,
     Key,
     Model,
     Params,
@@ -108,6 +109,7 @@ class LatentModel:
         learned: everything that is learned, besides the encoder.
         encoder: φ; None where z is the state.
         environment: whether e is used.
+        frame: the coordinates of states.
         soft_penalty: weight of `hinge`.
         beta: bound in `hinge`.
     """
@@ -116,6 +118,7 @@ class LatentModel:
     learned: Learned
     encoder: Encoder | None
     environment: bool
+    frame: Frame
     soft_penalty: float = 0.0
     beta: float = 0.0
 
@@ -215,7 +218,7 @@ class LatentModel:
         shared = fiber.shared
         linear = terms.A @ latent.z
         z = linear + apply(shared.residual.matrices, terms.residual, latent.z)
-        # Along a path there is no pose: that of the start stays.
+        # Without a decoder there is no pose: that of the start stays.
         if not shared.decoder.matrices:
             return PosedLatent(latent.pose, z)
         # The motion during the period starts from z before the step.
@@ -340,7 +343,7 @@ class LatentModel:
                 # tell.
                 rate=self.rate if self.learned.bounded else None,
             ),
-            along_path=not self.learned.pose,
+            frame=self.frame,
         )
 
 

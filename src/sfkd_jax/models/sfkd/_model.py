@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from sfkd_jax.models._networks import FRAMES, Encoder, Sandwich
+from dataclasses import replace
+
+from sfkd_jax.models._networks import Encoder, Sandwich
 from sfkd_jax.models._planning import Planning
 from sfkd_jax.models.sfkd._latent_model import LatentModel
 from sfkd_jax.models.sfkd._learned import LOWEST_RATE, Learned
 from sfkd_jax.models.sfkd._residual import BUDGETS, RESIDUALS
 from sfkd_jax.ranges import Fraction, NonNegativeInt, check_choice
-from sfkd_jax.types import Model, Space
+from sfkd_jax.types import BODY_FRAME, Frame, Model, Space
 
 LIFTS = ("network", "state")
 
@@ -26,7 +28,7 @@ def sfkd(
     linear_lift: bool = True,
     lift: str = "network",
     embedding: int = 16,
-    frame: str = "body",
+    frame: Frame = BODY_FRAME,
     residual: str = "sandwich",
     budget: str = "joint",
     transport: bool = True,
@@ -68,8 +70,8 @@ def sfkd(
         lift: "network" for φ, or "state" for z = C⁻¹ (s − c), coordinates in which a
             step contracts. The error of a step is then that of the state alone.
         embedding: size of ψ(e).
-        frame: "body" composes the pose on SE(2) outside z; "path" has path coordinates
-            as body state (see `geometry`) and no pose.
+        frame: the coordinates of states. A pose is composed on SE(2) outside z; without
+            one the body state is all.
         residual: "sandwich", "free" (without a bound by construction; ||A_j|| ≤ ρ) or
             "none" (||A_j|| ≤ ρ).
         budget: "joint" or "sum", of a sandwich residual.
@@ -81,13 +83,12 @@ def sfkd(
             and ρ + β, starting close to the latter.
         forcing_hidden: width of f(u, e) = V tanh(G(e) u + h(e)), which is added to
             B(e) u; 0 for none. It is no function of z, so every bound still holds.
-        scheduled: whether the mixture of the A_j reads u as well as e. Along a path u
-            has the reference speed and curvature, on which the closed loop depends
-            most.
+        scheduled: whether the mixture of the A_j reads u as well as e. A closed loop
+            depends most on its inputs from the reference, which are part of u.
         planning_residual: whether planners add a residual g to F, see `Planning`. No
             certificate is about g: F alone is certified, and the shield uses F.
     """
-    _check_choices(frame, residual, budget, lift)
+    _check_choices(residual, budget, lift)
     state_lift = lift == "state"
     if state_lift:
         rank = space.body_mean.shape[0]
@@ -106,8 +107,7 @@ def sfkd(
         # A residual without a bound has none that the operators could share.
         joint=budget == "joint" and residual_class is Sandwich,
         transport=transport,
-        # Along a path the offsets are part of s, and there is no pose to decode.
-        pose=frame != "path",
+        pose=frame.has_pose,
         learn_alpha=learn_alpha,
         forcing_hidden=forcing_hidden,
         state_lift=state_lift,
@@ -115,16 +115,15 @@ def sfkd(
     )
     _check_combinations(learned, soft_penalty)
     encoder = None if state_lift else Encoder(rank, encoder_hidden, linear_lift)
-    latent_model = LatentModel(space, learned, encoder, environment, soft_penalty, beta)
-    model = latent_model.model()
+    latent_model = LatentModel(space, learned, encoder, environment, frame)
+    model = replace(latent_model, soft_penalty=soft_penalty, beta=beta).model()
     if planning_residual:
         return Planning(model, space, environment).model()
     return model
 
 
-def _check_choices(frame: str, residual: str, budget: str, lift: str) -> None:
+def _check_choices(residual: str, budget: str, lift: str) -> None:
     """Raise a ValueError that names a setting with an unknown value."""
-    check_choice("model.frame", frame, FRAMES)
     check_choice("model.residual", residual, RESIDUALS)
     check_choice("model.budget", budget, BUDGETS)
     check_choice("model.lift", lift, LIFTS)
