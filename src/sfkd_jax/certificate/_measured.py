@@ -39,10 +39,10 @@ class Boxes:
     """Domain of the measurements; nothing measured is claimed outside.
 
     Attributes:
-        state: of the body state, along a path of ξ.
-        control: of u, along a path of w = (ν, κ, v_ref).
+        state: of the body state.
+        control: of the control, with the inputs from the reference.
         env: E.
-        names: of the axes of logged data; None where the vehicle names them.
+        names: of the axes of logged data; None where the plant names them.
     """
 
     state: Box
@@ -57,8 +57,8 @@ class StepErrors:
 
     Attributes:
         latent: d̄, in the latent space.
-        position: of the position, along a path of e_y [m].
-        yaw: of the yaw, along a path of e_ψ [rad].
+        position: of the output "position" [m].
+        yaw: of the output "yaw" [rad].
         body: of the body state.
     """
 
@@ -102,7 +102,7 @@ class Tube:
         physical: radii of "position_m" [m], "yaw_rad" [rad] and "body".
         ultimate: d̄ / (1 − α), the limit of R_k.
         asymptotic: limits of the physical radii; None for increments, which add up.
-        largest_increment_m: longest step [m]; None along a path.
+        largest_increment_m: longest step [m]; None without a pose.
     """
 
     latent: Row

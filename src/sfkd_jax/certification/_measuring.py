@@ -103,7 +103,7 @@ def _hull(*arrays: Any) -> Box:
 def _longest_step(runs: Trajectory) -> float:
     """Return the longest way of a step in the runs [m].
 
-    An error of yaw moves the car by at most this length times the angle.
+    An error of yaw moves the body by at most this length times the angle.
     """
     moves = np.diff(np.asarray(runs.states, np.float64)[..., :2], axis=-2)
     return float(np.max(np.linalg.norm(moves, axis=-1)))

@@ -99,7 +99,7 @@ def split(
         if not np.isfinite(getattr(trajectories, name)).all():
             raise ValueError(
                 f"{name} of the trajectories are not finite: "
-                "check the vehicle that drove them"
+                "check the plant that made them"
             )
     envs = trajectories.envs.reshape(-1, trajectories.envs.shape[-1])
     if not envs.shape[-1:] == np.shape(env_low) == np.shape(env_high):

@@ -145,10 +145,10 @@ def icode_mppi(
 
     Args:
         nominal: (x, u, e) -> dx/dt of the known dynamics in physical units. The caller
-            passes it in, since models never import the vehicle. A model that ignores e
+            passes it in, since models never import a plant. A model that ignores e
             passes the centre of the environment box to it.
         hidden: widths of f and of G.
-        affine_in: as for `icode`; with "control" the gain of the steering may depend on
+        affine_in: as for `icode`; with "control" the gain of the control may depend on
             friction.
 
     Source: Song et al., arXiv 2605.03260, eqs. 10 and 11.

@@ -22,7 +22,6 @@ orthogonality in float32.
 """
 SMALL = nn.initializers.variance_scaling(0.1, "fan_in", "truncated_normal")
 """Initial weights of a head whose output should start close to its bias."""
-"""Coordinates of a model: those of the world, or those along a path, without a pose."""
 
 
 class Weights(NamedTuple):

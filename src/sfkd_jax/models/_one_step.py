@@ -87,6 +87,6 @@ def one_step(space: Space, *, hidden: tuple[int, ...] = (64, 64)) -> Model:
 
 
 def _increment(before: State, after: State) -> State:
-    """Return the motion in the frame of the car, and the change of the body state."""
+    """Return the motion in the frame of the body, and the change of the body state."""
     pose = between(before[POSE], after[POSE])
     return jnp.concatenate([pose, after[BODY] - before[BODY]])

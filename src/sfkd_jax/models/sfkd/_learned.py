@@ -16,7 +16,7 @@ from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
 from sfkd_jax.types import Scalar
 
 LOWEST_RATE = 0.5
-"""Smallest learned α: no car converges to its path faster than that in 0.1 s."""
+"""Smallest learned α: no closed loop converges faster than that in 0.1 s."""
 ALPHA_START = 2.0
 """Initial logit of a learned α: 88 % of the way from the smallest to the largest."""
 
@@ -120,7 +120,7 @@ class Learned(nn.Module):
             logits = self.vertices * (1 + self.control)
         self.mixture_head = nn.Dense(logits, kernel_init=SMALL)
         self.input_head = nn.Dense(self.rank * self.control)
-        # A state that is the speed alone has no plane, but no layer may be empty.
+        # A state with one entry has no plane, but no layer may be empty.
         self.tangent_head = nn.Dense(max(self.rank // 2, 1), kernel_init=SMALL)
         # Every bias has a gain for each control, and an offset.
         entries = self.control + 1
@@ -282,6 +282,6 @@ def _couplings(key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _near_identity(key: Array, shape: tuple[int, ...]) -> Array:
-    """Draw operators near the identity, since a car changes little in 0.1 s."""
+    """Draw operators near the identity, since a state changes little in a sampling period."""
     noise = jax.random.normal(key, shape, jnp.float32) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=jnp.float32) + noise
