@@ -282,6 +282,6 @@ def _couplings(key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _near_identity(key: Array, shape: tuple[int, ...]) -> Array:
-    """Draw operators near the identity, since a state changes little in a sampling period."""
+    """Draw operators near the identity, since a state changes little in one step."""
     noise = jax.random.normal(key, shape, jnp.float32) * (0.1 / shape[-1] ** 0.5)
     return jnp.eye(shape[-1], dtype=jnp.float32) + noise
