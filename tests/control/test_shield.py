@@ -20,8 +20,9 @@ from sfkd_jax.certificate import (
     read,
 )
 from sfkd_jax.control import Conditions, along_reference, safety_filter
-from sfkd_jax.geometry import path_state, vehicle_state
+from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
+from sfkd_jax.path_coordinates import vehicle_state
 from sfkd_jax.plants import kinematic
 from sfkd_jax.policy import SHIPPED
 from sfkd_jax.rollout import unfold
@@ -55,7 +56,7 @@ def toy():
         fiber=lambda params, env: env,
         encode=lambda env, state: (1.0 + env[0]) * state[BODY],
         step=step,
-        decode=lambda env, latent: path_state(latent / (1.0 + env[0])),
+        decode=lambda env, latent: without_pose(latent / (1.0 + env[0])),
         transport=lambda env, after, latent: latent * (1.0 + after[0]) / (1.0 + env[0]),
         observe=lambda env, latent, state: (1.0 + env[0]) * state[BODY],
         vector=lambda latent: latent,
@@ -125,7 +126,7 @@ def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), seen=None):
         )
         road = jnp.asarray([0.0, SPEED])
         nu = action - LAW(xi, *road, env)
-        latent = TOY.encode(env, path_state(xi))
+        latent = TOY.encode(env, without_pose(xi))
         after = TOY.step(env, latent, jnp.concatenate([nu, road]))
         after = TOY.decode(env, after)[BODY] + disturbance
         return (after, memory), (xi, action, info)
@@ -338,7 +339,7 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
         inside.append(bool(info.env_inside))
         inputs = jnp.concatenate([info.shield.perturbation, jnp.asarray([0.0, SPEED])])
         xi = TOY.decode(
-            envs[k], TOY.step(envs[k], TOY.encode(envs[k], path_state(xi)), inputs)
+            envs[k], TOY.step(envs[k], TOY.encode(envs[k], without_pose(xi)), inputs)
         )[BODY]
     assert max(distances) < 1e-6
     assert list(np.flatnonzero(~np.asarray(inside))) == list(range(20, 25))

@@ -14,7 +14,7 @@ from sfkd_jax.assembly._controller_settings import (
 )
 from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
 from sfkd_jax.certificate import Certificate
-from sfkd_jax.geometry import CURVATURE, HEADING, PATH_SPEED, REFERENCE_SPEED
+from sfkd_jax.path_coordinates import CURVATURE, HEADING, PATH_SPEED, REFERENCE_SPEED
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
 from sfkd_jax.types import Controller, Model

@@ -9,7 +9,7 @@ import numpy as np
 
 from sfkd_jax import control, plants
 from sfkd_jax.certificate import Certificate, Corridor
-from sfkd_jax.geometry import HEADING, LATERAL
+from sfkd_jax.path_coordinates import HEADING, LATERAL
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05

@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 from scipy.special import betaincinv
 
 from sfkd_jax.certificate import Coverage
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, between
+from sfkd_jax.geometry import between
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 

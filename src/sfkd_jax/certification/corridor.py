@@ -51,7 +51,7 @@ from sfkd_jax.certification._tubes import (
 )
 from sfkd_jax.certification._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.data import drive_along_path, from_s3
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.path_coordinates import LATERAL
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.scenarios import DRIVES, DriveClass, random_switching
 from sfkd_jax.types import BODY, Key, Trajectory

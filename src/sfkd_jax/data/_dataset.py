@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.geometry import between, is_valid
+from sfkd_jax.geometry import between
+from sfkd_jax.path_coordinates import is_valid
 from sfkd_jax.rollout import windows
 from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
 

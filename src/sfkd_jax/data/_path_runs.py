@@ -17,7 +17,7 @@ from sfkd_jax.data._schedules import (
     planned_segments,
     schedules_along_path,
 )
-from sfkd_jax.geometry import path_state
+from sfkd_jax.geometry import without_pose
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import in_batches
@@ -147,7 +147,7 @@ def drive_along_path(
         beside = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray(offset)
         # The offset of the speed is relative to the reference speed.
         beside = beside.at[2].add(speeds[0])
-        start = path_state(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside))
+        start = without_pose(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside))
 
         def step(
             state: State, inputs: tuple[Control, Environment, Key]

@@ -18,7 +18,7 @@ from sfkd_jax.data._findings import more
 from sfkd_jax.data._log_files import fingerprint, log_files
 from sfkd_jax.data._logs import Columns, Log
 from sfkd_jax.data._reading import read_logs
-from sfkd_jax.geometry import PathState
+from sfkd_jax.path_coordinates import PathState
 from sfkd_jax.ranges import in_words
 from sfkd_jax.types import BODY, Control, Environment, Trajectory
 

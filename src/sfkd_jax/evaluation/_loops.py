@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
-from sfkd_jax.geometry import (
+from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.info import reported
+from sfkd_jax.path_coordinates import (
     HEADING,
     LATERAL,
     PATH_SPEED,
     curvature_ahead,
     path_coordinates,
-    wrap_angle,
 )
-from sfkd_jax.info import reported
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
 from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors

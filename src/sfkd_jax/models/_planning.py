@@ -11,8 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import PATH_SPEED, PathState, compose, path_state
+from sfkd_jax.geometry import compose
+from sfkd_jax.geometry import without_pose as path_state
 from sfkd_jax.models._state_model import state_model
+from sfkd_jax.path_coordinates import PATH_SPEED, PathState
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import (
     BODY,

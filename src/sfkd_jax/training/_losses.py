@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import HEADING, LATERAL
+from sfkd_jax.path_coordinates import HEADING, LATERAL
 from sfkd_jax.ranges import Numbers
 from sfkd_jax.rollout import Folded, fold, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory

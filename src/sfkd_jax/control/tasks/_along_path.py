@@ -28,20 +28,18 @@ from sfkd_jax.control.tasks._task import (
     StepResult,
     Task,
 )
-from sfkd_jax.geometry import (
+from sfkd_jax.geometry import between, entrywise, without_pose
+from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
+from sfkd_jax.path_coordinates import (
     HEADING,
     LATERAL,
     PATH_SPEED,
     PathState,
     beside,
-    between,
     curvature_ahead,
-    entrywise,
     followable,
     path_coordinates,
-    path_state,
 )
-from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -232,7 +230,7 @@ class FollowingLaw(LawTask):
         law_control = jnp.clip(first_turn.feedback(xi), low, high)
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
-        latent = self.model.encode(fiber, path_state(xi))
+        latent = self.model.encode(fiber, without_pose(xi))
         start = Sample(latent, xi, before)
         fibers = None
         if self.model.on_road is not None:
