@@ -31,7 +31,7 @@ ARROWS = {
     "path_coordinates": {"types", "geometry"},
     "rollout": {"types", "geometry"},
     "paths": {"types"},
-    "lanes": {"types", "paths"},
+    "lanes": {"types", "geometry", "paths"},
     "settings": {"ranges"},
     "store": set(),
     "certificate": {"ranges", "store"},
