@@ -14,6 +14,7 @@ import sfkd_jax
 from sfkd_jax import assembly, control, scenarios
 from sfkd_jax.certificate import (
     Boxes,
+    DrivingCertificate,
     JointBounds,
     Recorded,
     RecordedConditions,
@@ -432,7 +433,9 @@ def test_invalid_settings_are_refused_in_one_line(changes, line):
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     """A data set on one side of the path must not put the other side outside."""
-    certificate = read(SHIPPED / "kinematic_path" / "certificate.json")
+    certificate = read(
+        SHIPPED / "kinematic_path" / "certificate.json", DrivingCertificate
+    )
     bounds = replace(
         certificate.corridor.bounds, nominal=0.08, vehicle_to_nominal_position=0.06
     )
