@@ -86,7 +86,7 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
                 *control,
                 *env[:env_size],
                 *shield.perturbation,
-                *info.path.road,
+                *info.path.inputs,
             ]
             file.write(",".join(f"{float(value):.12g}" for value in row) + "\n")
 

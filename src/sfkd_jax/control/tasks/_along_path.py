@@ -99,7 +99,7 @@ class AlongReference(Stateful):
     This is the only place where a state is projected onto the path, once per control
     step. Predicted states are mapped back beside the points of the reference.
 
-    `info` gains `path`, see `PathInfo`; its ξ and road are NaN if the observation or
+    `info` gains `path`, see `PathInfo`; its ξ and inputs are NaN if the observation or
     the reference is not finite.
 
     Attributes:
@@ -163,7 +163,7 @@ class AlongReference(Stateful):
         seen = jnp.where(measured, xi, jnp.nan)
         info = info._replace(
             claim=info.claim.under(preview.reason),
-            path=PathInfo(xi=seen, road=road[0], planned=planned),
+            path=PathInfo(xi=seen, inputs=road[0], planned=planned),
         )
         return control, AlongReferenceState(inner, observation), info
 
