@@ -68,7 +68,9 @@ def claims():
     found = []
     for car in CARS:
         folder = PRETRAINED / policy_of(car)
-        claimed = certificate.read(folder / "certificate.json")
+        claimed = certificate.read(
+            folder / "certificate.json", certificate.DrivingCertificate
+        )
         _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
         about = claimed.corridor
         numbers = {

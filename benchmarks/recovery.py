@@ -21,8 +21,9 @@ from benchmarks import arguments, device, stamp, write
 from benchmarks.device import CARS, HORIZON, PERIOD
 from sfkd_jax import control, geometry, plants, scenarios
 from sfkd_jax.evaluation.metrics import room_in_lane
-from sfkd_jax.geometry import LATERAL, wrap_angle
+from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.info import ControllerInfo, PlanInfo
+from sfkd_jax.path_coordinates import LATERAL
 from sfkd_jax.types import Controller
 
 SPACING = 0.5

@@ -27,7 +27,9 @@ PREFIXES = {
 def main():
     """Print the line."""
     runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
-    claimed = certificate.read(runs[0] / "certificate.json")
+    claimed = certificate.read(
+        runs[0] / "certificate.json", certificate.DrivingCertificate
+    )
     corridor = claimed.corridor
     found = {
         "corridor_m": corridor.corridor_m,

@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from sfkd_jax import certification, control, models, plants, store
 from sfkd_jax import data as datasets
-from sfkd_jax.geometry import PATH_FRAME
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})

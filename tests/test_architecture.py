@@ -16,7 +16,8 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
-CORE = {"info", "types", "geometry", "rollout", "ranges", "paths", "lanes"}
+CORE = {"info", "types", "geometry", "path_coordinates", "rollout", "ranges"}
+CORE |= {"paths", "lanes"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
@@ -27,9 +28,10 @@ ARROWS = {
     "types": {"info"},
     "ranges": set(),
     "geometry": {"types"},
+    "path_coordinates": {"types", "geometry"},
     "rollout": {"types", "geometry"},
     "paths": {"types"},
-    "lanes": {"types", "paths"},
+    "lanes": {"types", "geometry", "paths"},
     "settings": {"ranges"},
     "store": set(),
     "certificate": {"ranges", "store"},

@@ -7,7 +7,7 @@ from composing import run
 from helpers import last_line, run_command
 
 from sfkd_jax import demo, policy
-from sfkd_jax.certificate import read
+from sfkd_jax.certificate import DrivingCertificate, read
 
 BODY = ("+experiment=s3_body", "controller=mppi_tiny", "demo.episode_s=9.0")
 PATH = ("controller.mppi.num_samples=30", "optimized=false", "demo.episode_s=6.0")
@@ -35,7 +35,7 @@ def test_the_demo_drives_without_training_and_draws_an_animation(
         assert own["departures"] == 0
     else:
         file = policy.SHIPPED / "kinematic_path" / "certificate.json"
-        corridor = read(file).corridor
+        corridor = read(file, DrivingCertificate).corridor
         assert own["max_deviation_m"] <= corridor.corridor_m
         assert f"corridor {corridor.corridor_m:.3f} m to each side" in done.stderr
 

@@ -152,7 +152,10 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
 
 
 def test_every_table_of_numbers_is_made_from_a_committed_result():
-    claims = certificate.read(pages.PRETRAINED / "kinematic_path/certificate.json")
+    claims = certificate.read(
+        pages.PRETRAINED / "kinematic_path/certificate.json",
+        certificate.DrivingCertificate,
+    )
     enemy = claims.corridor.attack.shielded_lateral_m
     limit = f"got the kinematic car {enemy:.1f} m aside"
     found = pages.read("experiments/simulator.json")

@@ -11,8 +11,8 @@ from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 
 from sfkd_jax import assembly, data, evaluation, models, plants, policy
-from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.info import ControllerInfo
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.plants import StateVariable
 from sfkd_jax.report.run import write_report
 from sfkd_jax.settings import schema

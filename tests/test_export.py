@@ -24,7 +24,14 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, optimised, space, s
 import sfkd_jax
 from sfkd_jax import assembly, certification, policy, store
 from sfkd_jax import export as exporting
-from sfkd_jax.certificate import Boxes, Certificate, Provenance, Refusal, read, write
+from sfkd_jax.certificate import (
+    Boxes,
+    DrivingCertificate,
+    Provenance,
+    Refusal,
+    read,
+    write,
+)
 from sfkd_jax.export import __main__ as export
 from sfkd_jax.lanes import Lane, Obstacles
 from sfkd_jax.paths import Path as Road
@@ -90,7 +97,7 @@ def exported(tmp_path_factory):
     )
     write(
         run_dir / "certificate.json",
-        Certificate(
+        DrivingCertificate(
             proof=proof, measured=measured, corridor=None, provenance=provenance
         ),
     )
@@ -324,7 +331,7 @@ def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
     requested = run(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
     run_dir = requested.directory
     assert (run_dir / "export" / "certificate.json").exists()
-    provenance = read(run_dir / "certificate.json").provenance
+    provenance = read(run_dir / "certificate.json", DrivingCertificate).provenance
     refusal = Refusal(reason="alpha is not below 1", provenance=provenance)
     write(run_dir / "certificate.json", refusal)
     printed = export.main(requested)

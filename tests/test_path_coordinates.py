@@ -11,7 +11,8 @@ import pytest
 from helpers import jit
 
 from sfkd_jax import plants
-from sfkd_jax.geometry import circle_errors, compose, is_valid, path_state
+from sfkd_jax.geometry import compose, without_pose
+from sfkd_jax.path_coordinates import circle_errors, is_valid
 from sfkd_jax.plants._along_path import step_with_law
 from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
@@ -74,7 +75,7 @@ def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
     )
     path = path_from_curvature(jnp.full(400, curvature), spacing=0.5)
     world = jnp.zeros(size).at[1].set(0.3).at[3].set(9.5)
-    along = path_state(world[1:])
+    along = without_pose(world[1:])
     progress = jnp.zeros(())
 
     @jax.jit

@@ -11,8 +11,8 @@ import pytest
 from helpers import put, refusal_of
 
 from sfkd_jax import policy, rollout, store
-from sfkd_jax.certificate import read
-from sfkd_jax.certification import CertificationRefused, verify
+from sfkd_jax.certificate import DrivingCertificate, read
+from sfkd_jax.certification import CertificationRefused, verify_driving
 
 POLICIES = ("kinematic", "dynamic", "kinematic_path", "dynamic_path")
 
@@ -196,12 +196,14 @@ def test_explicit_weights_ask_for_full_products(monkeypatch, full, holds):
 
     monkeypatch.setattr(rollout, "jax", Device())
     trained = policy.restore("kinematic_path")
-    honest = read(policy.SHIPPED / "kinematic_path" / "certificate.json")
+    honest = read(
+        policy.SHIPPED / "kinematic_path" / "certificate.json", DrivingCertificate
+    )
     if holds:
-        verify(honest, trained)
+        verify_driving(honest, trained)
         return
     with pytest.raises(CertificationRefused, match="does not follow from its witness"):
-        verify(honest, trained)
+        verify_driving(honest, trained)
 
 
 # --- weights --------------------------------------------------------------------------

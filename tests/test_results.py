@@ -69,7 +69,7 @@ DRIVEN = ("dynamic", 0.104, 6.8), ("kinematic", 0.291, 13.3)
 @pytest.mark.parametrize(("plant", "corridor", "error"), DRIVEN)
 def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error):
     path = PRETRAINED / f"{plant}_path" / "certificate.json"
-    claims = certificate.read(path).corridor
+    claims = certificate.read(path, certificate.DrivingCertificate).corridor
     assert round(claims.corridor_m, 3) == corridor
     assert claims.coverage.share >= 0.93
     sfkd, oracle = (

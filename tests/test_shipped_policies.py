@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import sfkd_jax
-from sfkd_jax.certificate import read
+from sfkd_jax.certificate import DrivingCertificate, read
 from sfkd_jax.policy import SHIPPED, policy_file
 
 ALONG_PATH = {"dynamic_path": 0.104, "kinematic_path": 0.291}
@@ -53,5 +53,7 @@ def test_what_is_neither_a_run_nor_a_name_is_refused_in_one_line(
 
 def test_a_policy_by_name_has_its_verified_certificate():
     loaded = sfkd_jax.load("kinematic")
-    assert loaded.certificate == read(SHIPPED / "kinematic" / "certificate.json")
+    assert loaded.certificate == read(
+        SHIPPED / "kinematic" / "certificate.json", DrivingCertificate
+    )
     assert loaded.signature == "unsigned"

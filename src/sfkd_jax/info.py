@@ -52,14 +52,14 @@ _ADVICE = {
     Reason.CERTIFIED: "The bound of the certificate holds.",
     Reason.NO_CERTIFICATE: "The controller has no certified corridor: certify it.",
     Reason.NOT_CALIBRATED: (
-        "The corridor is that of a model of logs, and not of the car: record runs of "
-        "the car, and collect them."
+        "The corridor is that of a model of logs, and not of the system itself: record "
+        "runs of the system, and collect them."
     ),
     Reason.ROLLING: (
         "The car is slower than the certificate covers; the bound goes on from its "
         "last value with the course of the car."
     ),
-    Reason.BAD_REFERENCE: "The reference is not finite, or no car could follow it.",
+    Reason.BAD_REFERENCE: "The reference is not finite, or nothing could follow it.",
     Reason.IMPRECISE: (
         "The type of the positions does not resolve them: pass float64, or positions "
         "relative to a point nearby."
@@ -70,7 +70,7 @@ _ADVICE = {
         "A part of the state is missing, implausible or late, and is predicted."
     ),
     Reason.ALARM: (
-        "The innovations are not those of the calibration: the vehicle or its sensors "
+        "The innovations are not those of the calibration: the system or its sensors "
         "have changed."
     ),
     Reason.TRIAL: (
@@ -79,12 +79,12 @@ _ADVICE = {
     ),
     Reason.NOT_STARTED: "No complete measurement has come yet.",
     Reason.OUTSIDE_BOX: (
-        "State, road or environment is outside the boxes of the certificate: check "
-        "their units; the law drives back alone."
+        "State, reference or environment is outside the boxes of the certificate: "
+        "check their units; the law returns alone."
     ),
     Reason.BOUND_EXCEEDED: (
-        "The car is farther from its nominal model than the certificate allows: the "
-        "bound does not hold for this car."
+        "The system is farther from its nominal model than the certificate allows: the "
+        "bound does not hold for this system."
     ),
     Reason.BRAKING: "The planner brakes harder than the certificate covers.",
     Reason.INFEASIBLE: "The law alone does not keep the nominal model in its corridor.",
@@ -171,12 +171,13 @@ class PathInfo(NamedTuple):
 
     Attributes:
         xi: measured ξ, (coordinate,); NaN where it is not measured.
-        road: κ [1/m] and v_ref [m/s] of this step, (2,).
+        inputs: of this step from the reference, (input,); along a path they are κ [1/m]
+            and v_ref [m/s].
         planned: predicted ξ along the chosen plan, (horizon, coordinate).
     """
 
     xi: Float[Array, " coordinate"]
-    road: Float[Array, " 2"]
+    inputs: Float[Array, " input"]
     planned: Float[Array, "horizon coordinate"] | None
 
 
@@ -187,7 +188,7 @@ class GateInfo(NamedTuple):
         measured: which entries of ξ are measured and not predicted, (coordinate,).
         innovation: measured less predicted ξ, (coordinate,); NaN without a comparison.
         statistic: of the test of the innovations, above 1 an alarm; NaN without a test.
-        alarm: whether vehicle or sensors are not those of the calibration.
+        alarm: whether system or sensors are not those of the calibration.
     """
 
     measured: Bool[Array, " coordinate"]
@@ -201,17 +202,16 @@ class AdaptationInfo(NamedTuple):
 
     Attributes:
         env: the e that the planner reads, (environment,).
-        causes: side force, steering error, drive error, and steering error and side
-            force in turns, (5,).
-        causes_std: their standard deviations, (5,).
+        causes: the unmeasured causes in the order of `control.Adaptation`, (cause,).
+        causes_std: their standard deviations, (cause,).
         rejected: whether nothing was learned from the measurement.
         adapting: whether the causes predict no worse than none; otherwise they are not
             used.
     """
 
     env: Float[Array, " environment"]
-    causes: Float[Array, " 5"]
-    causes_std: Float[Array, " 5"]
+    causes: Float[Array, " cause"]
+    causes_std: Float[Array, " cause"]
     rejected: Flag
     adapting: Flag
 
@@ -223,13 +223,13 @@ class ShieldInfo(NamedTuple):
         margin: distance of the nominal model to the edge of its corridor [m]; NaN
             without a nominal model.
         intervention: the removed share of the request; 0 if it passed, 1 outside the
-            boxes or if the car is steered back.
+            boxes or if the law returns alone.
         perturbation: ν on top of the law, in control units.
         nominal_state: ξ of the nominal model, (coordinate,).
-        nominal_distance: |e_y| between vehicle and nominal model [m]; NaN without a
+        nominal_distance: |e_y| between system and nominal model [m]; NaN without a
             comparison.
-        rolling: the part of the bound from below the slowest speed of the certificate
-            [m].
+        rolling: the part of the bound by which it has grown where the system is slower
+            than the certificate covers [m].
     """
 
     margin: Scalar

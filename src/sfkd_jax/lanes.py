@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sfkd_jax.geometry import outside_box
 from sfkd_jax.paths import Path
 
 
@@ -79,27 +80,6 @@ def circles(
         radius=zeros + radius,
         present=zeros == 0.0,
     )
-
-
-def outside_box(
-    along: Float[Array, "*shape"],
-    left: Float[Array, "*shape"],
-    half: tuple[Float[Array, "*shape"], Float[Array, "*shape"]],
-) -> Float[Array, ...]:
-    """Return the distance of a point from a box [m], negative inside.
-
-    Args:
-        along: from the centre of the box to the point, along the box [m].
-        left: from the centre of the box to the point, across the box [m].
-        half: half of length and width of the box [m].
-    """
-    along = jnp.abs(along) - half[0]
-    left = jnp.abs(left) - half[1]
-    # Outside, the distance is to the nearest corner or side. Inside, it is to the
-    # nearest side alone, and the first summand vanishes.
-    squared = jnp.maximum(along, 0.0) ** 2 + jnp.maximum(left, 0.0) ** 2
-    # 1e-12 keeps the derivative of the root finite at 0.
-    return jnp.sqrt(squared + 1e-12) + jnp.minimum(jnp.maximum(along, left), 0.0)
 
 
 def clearance(

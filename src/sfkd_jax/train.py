@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.certificate import Certificate
+from sfkd_jax.certificate import DrivingCertificate
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
@@ -66,7 +66,7 @@ def _run_stages(run: Run) -> dict[str, Any]:
     summary["certificate"] = str(run.certificate_path)
     summary["results"] = results
     summary["report"] = pages["report"]
-    is_certified = isinstance(certificate, Certificate)
+    is_certified = isinstance(certificate, DrivingCertificate)
     summary["alpha"] = certificate.proof.alpha if is_certified else None
     return summary
 

@@ -12,22 +12,22 @@ from sfkd_jax import models, policy, store
 from sfkd_jax.certificate import (
     Bounds,
     Boxes,
-    Certificate,
     Coverage,
+    DrivingCertificate,
     Provenance,
     read,
     write,
 )
-from sfkd_jax.certification import measure, prove, verify
-from sfkd_jax.certification._measured import coverage_interval
-from sfkd_jax.certification._tubes import (
+from sfkd_jax.certification import measure, prove, verify_driving
+from sfkd_jax.certification._corridor_bounds import (
     ALONE,
     JOINT,
     calibrate_corridor,
     corridor_coverage,
 )
+from sfkd_jax.certification._measured import coverage_interval
 from sfkd_jax.certification.corridor import closed_loop, measure_corridor
-from sfkd_jax.geometry import PATH_FRAME
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.plants import kinematic
 
 NAMES = (*JOINT, *ALONE)
@@ -116,7 +116,7 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     trained = policy.TrainedModel(
         model, params, kinematic(), any_law(), settings, "1" * 64, "0" * 64
     )
-    certificate = Certificate(
+    certificate = DrivingCertificate(
         proof=proof,
         measured=measured,
         corridor=corridor,
@@ -128,9 +128,9 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
         ),
     )
     write(tmp_path / "certificate.json", certificate)
-    again = read(tmp_path / "certificate.json")
+    again = read(tmp_path / "certificate.json", DrivingCertificate)
     assert replace(again, sha256="") == certificate
-    verify(again, trained)
+    verify_driving(again, trained)
     assert measured.outputs.keys() == {"position", "yaw"}
     assert corridor.conditions.acceleration == 2.0
     groups = corridor.by_group

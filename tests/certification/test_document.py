@@ -12,12 +12,13 @@ from documents import hashed, policy_copy
 from helpers import put, refusal_of
 
 from sfkd_jax import certificate, policy, store
-from sfkd_jax.certificate import parse, read, write
+from sfkd_jax.certificate import Certificate, DrivingCertificate, parse, read, write
 from sfkd_jax.certification import (
     CertificateStale,
     CertificationRefused,
     _verification,
     verify,
+    verify_driving,
 )
 from sfkd_jax.certification._weights import exported
 
@@ -39,7 +40,7 @@ def document(name):
 def refusal(changed, name):
     """Why a document is refused, in one line; None if it is accepted."""
     try:
-        verify(parse(changed), shipped(name))
+        verify_driving(parse(changed, DrivingCertificate), shipped(name))
     except (ValueError, CertificationRefused, CertificateStale) as reason:
         line = str(reason)
     else:
@@ -73,11 +74,21 @@ def few_weights(monkeypatch):
 @pytest.mark.parametrize("name", POLICIES)
 def test_what_ships_is_verified_and_is_written_as_it_was_read(name, tmp_path):
     path = policy.SHIPPED / name / "certificate.json"
-    honest = read(path)
-    verify(honest, shipped(name))
+    honest = read(path, DrivingCertificate)
+    verify_driving(honest, shipped(name))
     write(tmp_path / "again.json", honest)
-    assert store.read_json(tmp_path / "again.json") == store.read_json(path)
-    assert read(tmp_path / "again.json") == honest
+    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+    assert read(tmp_path / "again.json", DrivingCertificate) == honest
+
+
+def test_a_document_has_the_entries_of_the_class_that_it_is_read_as():
+    driving = document("kinematic")
+    general = hashed({name: driving[name] for name in driving if name != "corridor"})
+    verify(parse(general, Certificate), shipped("kinematic"))
+    with pytest.raises(ValueError, match="corridor is missing"):
+        parse(general, DrivingCertificate)
+    with pytest.raises(ValueError, match="'corridor' is not an entry"):
+        parse(driving, Certificate)
 
 
 # --- forgeries ------------------------------------------------------------------------
@@ -126,7 +137,7 @@ def test_a_changed_entry_is_refused_while_the_hash_is_that_of_before(name):
         tried += 1
         changed = put(honest, path, f"{value}_" if isinstance(value, str) else -1.5)
         with pytest.raises(ValueError, match="changed since it was written"):
-            parse(changed)
+            parse(changed, DrivingCertificate)
     assert tried > 40
 
 
@@ -225,7 +236,7 @@ def test_an_entry_that_is_missing_is_named():
 )
 def test_a_file_that_is_no_certificate_is_refused_in_one_line(text, tmp_path):
     (tmp_path / "certificate.json").write_text(text)
-    line = refusal_of(lambda: read(tmp_path / "certificate.json"))
+    line = refusal_of(lambda: read(tmp_path / "certificate.json", DrivingCertificate))
     assert "certificate.json: " in line
 
 
@@ -236,9 +247,9 @@ def test_settings_nested_without_end_are_refused_in_one_line(tmp_path):
     forged = hashed(put(document("kinematic"), "provenance.settings", nested))
     path = tmp_path / "certificate.json"
     path.write_text(json.dumps(forged))
-    read(path)
+    read(path, DrivingCertificate)
     path.write_text(json.dumps(forged).replace('{"a": {}}', '{"a": ' * 10**5))
-    assert "certificate.json: " in refusal_of(lambda: read(path))
+    assert "certificate.json: " in refusal_of(lambda: read(path, DrivingCertificate))
 
 
 # --- about one policy -----------------------------------------------------------------
@@ -272,7 +283,9 @@ def test_a_setting_that_changed_leaves_nothing_certified_and_says_so(
 
 def test_a_certificate_of_one_policy_is_stale_beside_another():
     with pytest.raises(CertificateStale):
-        verify(parse(document("dynamic")), shipped("kinematic"))
+        verify_driving(
+            parse(document("dynamic"), DrivingCertificate), shipped("kinematic")
+        )
     about = {"policy_sha256": shipped("kinematic").sha256}
     about |= {"weights_sha256": shipped("kinematic").weights_sha256}
     provenance = document("dynamic")["provenance"] | about
@@ -289,7 +302,10 @@ def test_one_weight_that_moved_by_the_smallest_step_is_noticed():
     }
     assert jax.tree.structure(params) == jax.tree.structure(trained.params)
     with pytest.raises(CertificateStale, match="about other weights"):
-        verify(parse(document("kinematic")), replace(trained, params=params))
+        verify_driving(
+            parse(document("kinematic"), DrivingCertificate),
+            replace(trained, params=params),
+        )
 
 
 def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
@@ -300,9 +316,9 @@ def test_a_forged_certificate_is_an_error_that_names_the_file(copied):
 
 
 def test_the_reason_of_a_refusal_is_told_in_one_printable_line(copied):
-    provenance = read(copied / "certificate.json").provenance
+    provenance = read(copied / "certificate.json", DrivingCertificate).provenance
     refused = certificate.Refusal(reason="no\nbound\x1b[31m", provenance=provenance)
     write(copied / "certificate.json", refused)
-    assert read(copied / "certificate.json") == refused
+    assert read(copied / "certificate.json", DrivingCertificate) == refused
     with pytest.warns(UserWarning, match=r"was refused: no bound\\x1b\[31m$"):
         policy.load(copied)

@@ -10,7 +10,7 @@ from helpers import put, refusal_of
 
 import sfkd_jax
 from sfkd_jax import certificate, policy, store
-from sfkd_jax.certificate import Certificate, read, write
+from sfkd_jax.certificate import DrivingCertificate, read, write
 from sfkd_jax.experiment import stages
 
 
@@ -43,7 +43,7 @@ def signed(tmp_path, keys):
     """A run directory whose certificate is signed with `keys`."""
     run = policy_copy(tmp_path, "dynamic_path")
     path = run / "certificate.json"
-    write(path, read(path), signing_key=str(keys[0]))
+    write(path, read(path, DrivingCertificate), signing_key=str(keys[0]))
     return run
 
 
@@ -58,12 +58,12 @@ def test_a_signed_certificate_loads_with_its_key_and_says_who_signed(signed, key
 
 def test_a_signature_stays_with_what_it_is_about_alone(signed, keys):
     path = signed / "certificate.json"
-    original = read(path)
+    original = read(path, DrivingCertificate)
     write(path, original)
-    assert read(path) == original
+    assert read(path, DrivingCertificate) == original
     narrow = replace(original.corridor, seconds=0.0)
     write(path, replace(original, corridor=narrow))
-    assert read(path).signature is None
+    assert read(path, DrivingCertificate).signature is None
 
 
 def forge(run):
@@ -122,7 +122,7 @@ def test_a_damaged_signature_is_refused_in_one_line(signed, keys, value):
 
 def test_files_that_are_no_keys_are_refused_in_one_line(keys, tmp_path):
     private, public = keys
-    honest = read(policy.SHIPPED / "kinematic" / "certificate.json")
+    honest = read(policy.SHIPPED / "kinematic" / "certificate.json", DrivingCertificate)
     for file in (public, tmp_path / "missing.pem"):
         line = refusal_of(
             lambda file=file: write(tmp_path / "c.json", honest, signing_key=str(file))
@@ -138,7 +138,7 @@ def test_without_cryptography_a_signature_is_not_believed(monkeypatch):
     assert "which is not checked" in certificate.describe_signature("00", name)
     with pytest.raises(ValueError, match=r"sfkd-jax\[sign\]"):
         sfkd_jax.load("kinematic", signed_by="ab" * 32)
-    assert isinstance(sfkd_jax.load("kinematic").certificate, Certificate)
+    assert isinstance(sfkd_jax.load("kinematic").certificate, DrivingCertificate)
 
 
 def test_a_key_that_is_none_stops_the_command_before_it_trains(tmp_path):

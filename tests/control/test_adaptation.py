@@ -12,8 +12,9 @@ from sfkd_jax import assembly, certification, control, models, plants
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.control.wrappers import _estimator as estimator
 from sfkd_jax.control.wrappers._adaptation import _compensation
-from sfkd_jax.geometry import PATH_FRAME, path_state
+from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
@@ -138,10 +139,10 @@ def test_an_offset_shifts_a_step_and_nothing_else():
     model, params = model_and_params("path")
     shifted, env = with_offset(model), jnp.asarray([0.5, 3.0])
     fiber = model.fiber(params, env)
-    states = [path_state(jnp.asarray([9.5 + k])) for k in range(2)]
+    states = [without_pose(jnp.asarray([9.5 + k])) for k in range(2)]
     control_, delta = jnp.asarray([0.01, 0.2]), jnp.full(2, 0.01)
     latents = [model.encode(fiber, state) for state in states]
-    push = states[0], path_state(jnp.asarray([0.1]))
+    push = states[0], without_pose(jnp.asarray([0.1]))
     _, lifted = jax.jvp(partial(model.encode, fiber), push[:1], push[1:])
     fiber_ = shifted.fiber(Offset(params, delta, push), env)
     plain = [model.step(fiber, latent, control_ + delta) for latent in latents]
@@ -266,7 +267,7 @@ def test_a_force_beyond_the_box_is_balanced_without_a_lateral_error():
             first = shifted.step(fiber, states[0], w)
             return (first, MODEL.step(plain, states[1], w)), None
 
-        start = path_state(xi)
+        start = without_pose(xi)
         (pushed, alone), _ = jax.lax.scan(both, (start, start), length=300)
         return (pushed - alone)[BODY][0]
 

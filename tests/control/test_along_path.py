@@ -9,7 +9,7 @@ import pytest
 from helpers import any_law, tiny
 
 from sfkd_jax import assembly, control, plants
-from sfkd_jax.geometry import curvature_ahead, path_coordinates
+from sfkd_jax.path_coordinates import curvature_ahead, path_coordinates
 from sfkd_jax.scenarios import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()

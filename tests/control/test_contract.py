@@ -24,7 +24,6 @@ from helpers import (
 from jaxtyping import jaxtyped
 
 from sfkd_jax import assembly, control, models, plants
-from sfkd_jax.geometry import PATH_FRAME
 from sfkd_jax.info import (
     AdaptationInfo,
     Claim,
@@ -38,6 +37,7 @@ from sfkd_jax.info import (
     first,
     reported,
 )
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import fold, with_offset
 
 PLANT = plants.kinematic()

@@ -10,7 +10,7 @@ from helpers import jit, straight
 
 from sfkd_jax import control, models, plants, scenarios
 from sfkd_jax.control import PathErrors, StageInputs
-from sfkd_jax.geometry import followable
+from sfkd_jax.path_coordinates import followable
 from sfkd_jax.scenarios import reference_window
 
 ERRORS = jit(jax.vmap(control.path_errors))

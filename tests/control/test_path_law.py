@@ -13,7 +13,8 @@ from helpers import jit
 from sfkd_jax import assembly, plants, policy
 from sfkd_jax.control import TEXTBOOK, derive_path_law, textbook_law
 from sfkd_jax.experiment import identified, laws
-from sfkd_jax.geometry import path_state, path_step
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import path_step
 from sfkd_jax.types import BODY
 
 BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}
@@ -75,7 +76,7 @@ def test_the_law_alone_keeps_the_car_on_its_path(derived, env):
     plant, law = derived
     loop = plants.along_path(plant, law)
     inputs = jnp.asarray([0.0, 0.0, 0.016, 10.0])
-    start = path_state(
+    start = without_pose(
         jnp.zeros(len(plant.state_names) - 1).at[0].set(0.4).at[2].set(9.0)
     )
     drive = jit(
@@ -95,7 +96,7 @@ def test_the_loop_contracts_alike_where_tyres_give_little(derived):
     plant, law = derived
     loop = plants.along_path(plant, law)
     inputs = jnp.asarray([0.0, 0.0, 0.02, 10.0])
-    step = lambda xi, e: loop.step(path_state(xi), inputs, e)[BODY]
+    step = lambda xi, e: loop.step(without_pose(xi), inputs, e)[BODY]
     slopes = jit(lambda e: jax.jacfwd(step)(law.turn(*inputs[2:], e).state, e))
     for env in ((0.3, 8.0), (0.9, 0.0)):
         slope = slopes(jnp.asarray(env))
@@ -137,7 +138,7 @@ def test_from_far_away_the_shipped_law_comes_back(name):
     def last_second(xi, env, curvature):
         inputs = jnp.stack([0.0, 0.0, curvature, 9.0])
         step = lambda x, _: (loop.step(x, inputs, env), x[BODY][:2])
-        return jax.lax.scan(step, path_state(xi), length=210)[1][-10:]
+        return jax.lax.scan(step, without_pose(xi), length=210)[1][-10:]
 
     ends = np.asarray(jit(jax.vmap(last_second))(xi, env, bend))
     assert np.max(np.abs(ends[..., 0])) < 0.3
@@ -148,7 +149,7 @@ def test_the_law_brakes_to_a_standstill_and_stays_there():
     policy_of = policy.restore(policy.SHIPPED / "dynamic_path")
     loop = plants.along_path(policy_of.vehicle, policy_of.law)
     inputs, env = jnp.zeros(4), jnp.asarray([0.5, 4.0])
-    start = path_state(jnp.zeros(6).at[0].set(0.1).at[2].set(8.0))
+    start = without_pose(jnp.zeros(6).at[0].set(0.1).at[2].set(8.0))
     step = lambda x, _: (loop.step(x, inputs, env), x[BODY])
     track = np.asarray(jit(lambda x: jax.lax.scan(step, x, length=300)[1])(start))
     assert np.max(np.abs(track[:, 0])) < 0.2

@@ -14,14 +14,16 @@ import sfkd_jax
 from sfkd_jax import assembly, control, scenarios
 from sfkd_jax.certificate import (
     Boxes,
+    DrivingCertificate,
     JointBounds,
     Recorded,
     RecordedConditions,
     read,
 )
 from sfkd_jax.control import Conditions, along_reference, safety_filter
-from sfkd_jax.geometry import PATH_FRAME, path_state, vehicle_state
+from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
+from sfkd_jax.path_coordinates import PATH_FRAME, vehicle_state
 from sfkd_jax.plants import kinematic
 from sfkd_jax.policy import SHIPPED
 from sfkd_jax.rollout import unfold
@@ -55,7 +57,7 @@ def toy():
         fiber=lambda params, env: env,
         encode=lambda env, state: (1.0 + env[0]) * state[BODY],
         step=step,
-        decode=lambda env, latent: path_state(latent / (1.0 + env[0])),
+        decode=lambda env, latent: without_pose(latent / (1.0 + env[0])),
         transport=lambda env, after, latent: latent * (1.0 + after[0]) / (1.0 + env[0]),
         observe=lambda env, latent, state: (1.0 + env[0]) * state[BODY],
         vector=lambda latent: latent,
@@ -125,7 +127,7 @@ def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), seen=None):
         )
         road = jnp.asarray([0.0, SPEED])
         nu = action - LAW(xi, *road, env)
-        latent = TOY.encode(env, path_state(xi))
+        latent = TOY.encode(env, without_pose(xi))
         after = TOY.step(env, latent, jnp.concatenate([nu, road]))
         after = TOY.decode(env, after)[BODY] + disturbance
         return (after, memory), (xi, action, info)
@@ -338,7 +340,7 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
         inside.append(bool(info.env_inside))
         inputs = jnp.concatenate([info.shield.perturbation, jnp.asarray([0.0, SPEED])])
         xi = TOY.decode(
-            envs[k], TOY.step(envs[k], TOY.encode(envs[k], path_state(xi)), inputs)
+            envs[k], TOY.step(envs[k], TOY.encode(envs[k], without_pose(xi)), inputs)
         )[BODY]
     assert max(distances) < 1e-6
     assert list(np.flatnonzero(~np.asarray(inside))) == list(range(20, 25))
@@ -431,7 +433,9 @@ def test_invalid_settings_are_refused_in_one_line(changes, line):
 
 def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     """A data set on one side of the path must not put the other side outside."""
-    certificate = read(SHIPPED / "kinematic_path" / "certificate.json")
+    certificate = read(
+        SHIPPED / "kinematic_path" / "certificate.json", DrivingCertificate
+    )
     bounds = replace(
         certificate.corridor.bounds, nominal=0.08, vehicle_to_nominal_position=0.06
     )

@@ -9,7 +9,7 @@ from helpers import dataset, driven, jit, model_and_params
 
 from sfkd_jax import evaluation, models, plants
 from sfkd_jax.experiment.identified import least_squares
-from sfkd_jax.geometry import PATH_FRAME
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.types import Trajectory
 
 DT = 0.1

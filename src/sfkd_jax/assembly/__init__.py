@@ -40,8 +40,8 @@ from sfkd_jax.assembly._vehicles import VehicleSettings as VehicleSettings
 from sfkd_jax.assembly._vehicles import build_driver as build_driver
 from sfkd_jax.assembly._vehicles import build_vehicle as build_vehicle
 from sfkd_jax.assembly._vehicles import takes_logs as takes_logs
-from sfkd_jax.certificate import Certificate
-from sfkd_jax.geometry import PATH_FRAME
+from sfkd_jax.certificate import DrivingCertificate
+from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -200,7 +200,7 @@ class System(NamedTuple):
     model: Model
     params: Any
     env_source: str
-    certificate: Certificate | None = None
+    certificate: DrivingCertificate | None = None
     law: control.PathLaw | None = None
 
 

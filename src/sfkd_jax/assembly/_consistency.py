@@ -11,7 +11,7 @@ import numpy as np
 
 from sfkd_jax import plants
 from sfkd_jax.assembly._vehicles import FROM_OUTSIDE
-from sfkd_jax.geometry import PATH_SPEED
+from sfkd_jax.path_coordinates import PATH_SPEED
 from sfkd_jax.settings import Values
 
 

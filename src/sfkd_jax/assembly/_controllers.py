@@ -13,8 +13,8 @@ from sfkd_jax.assembly._controller_settings import (
     SearchSettings,
 )
 from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
-from sfkd_jax.certificate import Certificate
-from sfkd_jax.geometry import (
+from sfkd_jax.certificate import DrivingCertificate
+from sfkd_jax.path_coordinates import (
     CURVATURE,
     HEADING,
     PATH_FRAME,
@@ -54,7 +54,7 @@ def build_controller(
     *,
     env_low: Corner = None,
     env_high: Corner = None,
-    certificate: Certificate | None = None,
+    certificate: DrivingCertificate | None = None,
     env_source: str = "measured",
     law: control.PathLaw | None = None,
     adaptive: bool = False,
@@ -286,7 +286,7 @@ def _along_reference(
     inner: Controller,
     settings: SearchSettings,
     loop: _Loop,
-    certificate: Certificate | None,
+    certificate: DrivingCertificate | None,
 ) -> Controller:
     """Return a controller along a path behind its gate, as one of references."""
     corridor = certificate.corridor if certificate else None
@@ -316,7 +316,7 @@ def build_in_lane(
     inner: Controller,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Certificate,
+    certificate: DrivingCertificate,
     *,
     horizon: int,
     car: tuple[float, float],
@@ -353,7 +353,7 @@ def build_in_lane(
 def _admissible_references(
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Certificate,
+    certificate: DrivingCertificate,
     car: tuple[float, float],
 ) -> control.Class:
     """Return the class of references of which a corridor was certified."""

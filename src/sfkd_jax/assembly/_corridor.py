@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax import control, plants
-from sfkd_jax.certificate import Certificate, Corridor
-from sfkd_jax.geometry import HEADING, LATERAL
+from sfkd_jax.certificate import Corridor, DrivingCertificate
+from sfkd_jax.path_coordinates import HEADING, LATERAL
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
@@ -26,7 +26,7 @@ Corner = Sequence[float] | None
 """Lower or upper ends of the environment box E, if they are known."""
 
 
-def corridor_of(certificate: Certificate) -> Corridor:
+def corridor_of(certificate: DrivingCertificate) -> Corridor:
     """Return the corridor of a certificate, with the bounds that are in force.
 
     Raises:
@@ -42,7 +42,7 @@ def in_corridor(
     model: Model,
     plant: plants.Vehicle,
     law: control.PathLaw,
-    certificate: Certificate,
+    certificate: DrivingCertificate,
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
@@ -101,7 +101,7 @@ def _sensor_noise(corridor: Corridor) -> tuple[float, float]:
 
 
 def conditions_of(
-    certificate: Certificate | None,
+    certificate: DrivingCertificate | None,
     *,
     env_low: Corner = None,
     env_high: Corner = None,
@@ -117,7 +117,7 @@ def conditions_of(
     return control.Conditions(env=_box(env_low, env_high))
 
 
-def _certified_conditions(certificate: Certificate) -> control.Conditions:
+def _certified_conditions(certificate: DrivingCertificate) -> control.Conditions:
     """Return the boxes of a certificate, somewhat enlarged.
 
     The box of e_y contains the corridor, since the claim holds there, whether or not

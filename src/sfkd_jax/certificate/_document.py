@@ -7,11 +7,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 from sfkd_jax import store
 from sfkd_jax.certificate import _signature
-from sfkd_jax.certificate._corridor import Corridor
 from sfkd_jax.certificate._measured import Measured
 from sfkd_jax.certificate._proof import Proof
 from sfkd_jax.certificate._reading import read_as
@@ -49,12 +48,11 @@ class Provenance:
 
 @dataclass(frozen=True, kw_only=True)
 class Certificate:
-    """A certificate of a policy.
+    """A certificate of a policy; what else is measured of one is added by subclasses.
 
     Attributes:
         proof: what is proved; `certification.verify` checks it.
         measured: what is measured on data.
-        corridor: what is measured in the closed loop; None for a policy without one.
         provenance: what it is about, and how it was made.
         sha256: hash of the document that it was read from; "" if of none.
         signature: of the document, or None.
@@ -62,10 +60,12 @@ class Certificate:
 
     proof: Proof
     measured: Measured
-    corridor: Corridor | None
     provenance: Provenance
     sha256: str = ""
     signature: Signature | None = None
+
+
+C = TypeVar("C", bound=Certificate)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +96,13 @@ def write(
     """
     entries = store.plain(asdict(certificate))
     kept = {name: entries.pop(name, None) for name in UNHASHED}
+    # What is claimed comes first, also where a subclass adds to it.
+    provenance = entries.pop("provenance")
     document = {
         "format": FORMAT,
         "valid": isinstance(certificate, Certificate),
         **entries,
+        "provenance": provenance,
     }
     digest = _hash(document)
     signature = kept["signature"] if kept["sha256"] == digest else None
@@ -108,8 +111,12 @@ def write(
     store.write_json(path, {**document, "sha256": digest, "signature": signature})
 
 
-def read(path: Path) -> Certificate | Refusal:
+def read(path: Path, kind: type[C]) -> C | Refusal:
     """Read a certificate from an untrusted source; nothing in it is proved yet.
+
+    Args:
+        path: of the file.
+        kind: `Certificate` or a subclass; the document has the entries of this class.
 
     Raises:
         ArtefactError: it is damaged, of another format, or was changed since it was
@@ -118,13 +125,13 @@ def read(path: Path) -> Certificate | Refusal:
     document = store.read_json(path)
     with store.as_artefact_error(path):
         try:
-            return parse(document)
+            return parse(document, kind)
         except ValueError as reason:
             raise store.failure(path, reason) from None
 
 
-def parse(document: Mapping[str, Any]) -> Certificate | Refusal:
-    """Return the certificate of a document.
+def parse(document: Mapping[str, Any], kind: type[C]) -> C | Refusal:
+    """Return the certificate of a document, see `read`.
 
     Raises:
         ValueError: an entry is missing, unknown, of another type or range, or was
@@ -141,7 +148,7 @@ def parse(document: Mapping[str, Any]) -> Certificate | Refusal:
         raise ValueError("it was changed since it was written: its sha256 is another")
     # `is True`, because the text "false" or a number must not pass.
     if document.get("valid") is True:
-        return read_as(Certificate, entries)
+        return read_as(kind, entries)
     refused = {key: entries[key] for key in entries if key not in UNHASHED}
     return read_as(Refusal, refused)
 

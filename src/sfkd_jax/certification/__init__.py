@@ -20,3 +20,9 @@ from sfkd_jax.certification._tubes import latent_tube as latent_tube
 from sfkd_jax.certification._verification import verify as verify
 from sfkd_jax.certification._weights import CertificateStale as CertificateStale
 from sfkd_jax.certification._weights import CertificationRefused as CertificationRefused
+
+# isort: split
+# Of a policy that drives:
+from sfkd_jax.certification._corridor_verification import (
+    verify_driving as verify_driving,
+)

@@ -19,7 +19,7 @@ from sfkd_jax.certification._claims import rows
 from sfkd_jax.certification._measured import alarm_thresholds
 from sfkd_jax.control import InnovationTest, PathLaw, expected_coordinates, turning_rate
 from sfkd_jax.data import sensor_keys
-from sfkd_jax.geometry import (
+from sfkd_jax.path_coordinates import (
     CURVATURE,
     HEADING,
     LATERAL,

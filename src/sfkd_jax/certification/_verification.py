@@ -16,12 +16,10 @@ from sfkd_jax.certification._proving import verify_proof
 from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.certification._weights import (
     CertificateStale,
-    CertificationRefused,
     exported,
     require,
     well_formed,
 )
-from sfkd_jax.control import WINDOWS
 
 Trained: TypeAlias = Any
 """A `policy.TrainedModel`: what a certificate is about."""
@@ -74,29 +72,19 @@ def _require_what_follows(certificate: Certificate, trained: Trained) -> None:
     has_pose = trained.model.frame.has_pose
     require(
         (stated.largest_increment_m is not None) == has_pose
-        and _near(vars(stated), vars(derived), REPEATED),
+        and near(vars(stated), vars(derived), REPEATED),
         "measured.tube does not follow from the proof and d_bar",
     )
     environment = trained.settings["environment"]
     box = [environment.get("low"), environment.get("high")]
     # The environments of logs are measured, and the settings may state no box of them.
     require(
-        None in box or _near(proof.env_box, box, ROUNDED),
+        None in box or near(proof.env_box, box, ROUNDED),
         "proof.env_box is not that of the policy",
     )
     require(
         measured.boxes.env == proof.env_box, "measured.boxes.env is not proof.env_box"
     )
-    corridor = certificate.corridor
-    if corridor is None:
-        return
-    for part in filter(None, (corridor, corridor.recorded)):
-        # The triangle inequality: from the car to the nominal model, and to the path.
-        width = part.bounds.nominal + part.bounds.vehicle_to_nominal_position
-        require(
-            _near(part.corridor_m, width, REPEATED),
-            "corridor.corridor_m does not follow from its bounds",
-        )
 
 
 def _require_sizes(certificate: Certificate, trained: Trained) -> None:
@@ -107,39 +95,24 @@ def _require_sizes(certificate: Certificate, trained: Trained) -> None:
         low, _ = getattr(boxes, box)
         fits = len(low) == len(space[f"{part}_mean"])
         require(fits, f"measured.boxes.{box} is of another size than the policy")
-    corridor = certificate.corridor
     require(
         certificate.measured.outputs.keys() == certificate.proof.outputs.keys(),
         "measured.outputs are not those of the proof",
     )
-    if corridor is None:
-        return
-    law = trained.law
-    if law is None or not certificate.proof.outputs:
-        raise CertificationRefused("a corridor needs a law and metrics of the outputs")
-    charts = law.gain.shape[-1] + 1
-    innovations = corridor.innovations
-    shape = (len(innovations.levels), charts)
-    fits = (
-        np.shape(innovations.deviation) == shape
-        and np.shape(innovations.threshold) == (len(WINDOWS), charts)
-        and len(corridor.conditions.env_box[0]) == len(space["env_mean"])
-    )
-    require(fits, "corridor is of another size than the policy")
 
 
-def _near(stated: Any, derived: Any, tolerance: float) -> bool:
+def near(stated: Any, derived: Any, tolerance: float) -> bool:
     """Return whether numbers in equal structures are nearly equal, relative to derived.
 
     A forger can choose the stated value, and not the derived one.
     """
     if isinstance(derived, dict):
         return stated.keys() == derived.keys() and all(
-            _near(stated[key], derived[key], tolerance) for key in derived
+            near(stated[key], derived[key], tolerance) for key in derived
         )
     if derived is None or stated is None:
         return stated is derived
     expected = np.asarray(derived, float)
     actual = np.asarray(stated, float)
-    near = np.abs(actual - expected) <= tolerance * np.abs(expected)
-    return actual.shape == expected.shape and bool(np.all(near))
+    inside = np.abs(actual - expected) <= tolerance * np.abs(expected)
+    return actual.shape == expected.shape and bool(np.all(inside))

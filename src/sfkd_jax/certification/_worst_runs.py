@@ -16,13 +16,8 @@ from sfkd_jax.certificate import CorridorAttack, OutputMetric
 from sfkd_jax.certification._alarms import Loop
 from sfkd_jax.certification._attack import CertificateContradicted
 from sfkd_jax.control import safety_filter
-from sfkd_jax.geometry import (
-    LATERAL,
-    PATH_SPEED,
-    PERTURBATION,
-    REFERENCE_SPEED,
-    path_state,
-)
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import LATERAL, PATH_SPEED, PERTURBATION, REFERENCE_SPEED
 from sfkd_jax.types import BODY, Control, Environment, Key, Params
 
 BLOCK = 5
@@ -202,7 +197,7 @@ def outcome_of(
     run_inputs, envs = run
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     at_rest = jnp.zeros(len(plant.state_names) - BODY.start)
-    start = path_state(at_rest.at[PATH_SPEED].set(run_inputs[0, REFERENCE_SPEED]))
+    start = without_pose(at_rest.at[PATH_SPEED].set(run_inputs[0, REFERENCE_SPEED]))
     latent = model.encode(model.fiber(params, envs[0]), start)
 
     def step(carry: Any, at_step: tuple[Array, Environment, Array]) -> tuple[Any, Any]:

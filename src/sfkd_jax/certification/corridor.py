@@ -38,20 +38,17 @@ from sfkd_jax.certification._alarms import (
 )
 from sfkd_jax.certification._alarms import closed_loop as closed_loop
 from sfkd_jax.certification._claims import rows
+from sfkd_jax.certification._corridor_bounds import ALONE, JOINT, calibrate_corridor
+from sfkd_jax.certification._corridor_bounds import (
+    corridor_coverage as corridor_coverage,
+)
 from sfkd_jax.certification._measured import check_count as check_count
 from sfkd_jax.certification._measured import conformal_bounds, residuals
 from sfkd_jax.certification._metric_claims import OUTPUTS
-from sfkd_jax.certification._tubes import (
-    ALONE,
-    FORMS,
-    JOINT,
-    calibrate_corridor,
-    corridor_coverage,
-    radii,
-)
+from sfkd_jax.certification._tubes import FORMS, radii
 from sfkd_jax.certification._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.data import drive_along_path, from_s3
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.path_coordinates import LATERAL
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.scenarios import DRIVES, DriveClass, random_switching
 from sfkd_jax.types import BODY, Key, Trajectory

@@ -53,4 +53,4 @@ from sfkd_jax.control.wrappers._innovations import turning_rate as turning_rate
 from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES
 from sfkd_jax.control.wrappers._safety_filter import safety_filter as safety_filter
 from sfkd_jax.control.wrappers._shield import Shield as Shield
-from sfkd_jax.geometry import reference_curvature as reference_curvature
+from sfkd_jax.path_coordinates import reference_curvature as reference_curvature

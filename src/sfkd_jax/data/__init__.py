@@ -2,7 +2,6 @@
 
 from sfkd_jax.data._dataset import PARTS as PARTS
 from sfkd_jax.data._dataset import Dataset as Dataset
-from sfkd_jax.data._dataset import check_on_path as check_on_path
 from sfkd_jax.data._dataset import check_shares as check_shares
 from sfkd_jax.data._dataset import coverage as coverage
 from sfkd_jax.data._dataset import environment_box as environment_box
@@ -18,6 +17,7 @@ from sfkd_jax.data._generation import generate as generate
 from sfkd_jax.data._generation import generate_open_loop as generate_open_loop
 from sfkd_jax.data._log_files import fingerprint as fingerprint
 from sfkd_jax.data._logs import Columns as Columns
+from sfkd_jax.data._path_runs import check_on_path as check_on_path
 from sfkd_jax.data._path_runs import drive_along_path as drive_along_path
 from sfkd_jax.data._path_runs import generate_along_path as generate_along_path
 from sfkd_jax.data._path_runs import sensor_keys as sensor_keys

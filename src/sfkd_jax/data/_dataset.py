@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.geometry import between, is_valid
+from sfkd_jax.geometry import between
 from sfkd_jax.rollout import windows
 from sfkd_jax.types import BODY, POSE, Key, Space, Trajectory
 
@@ -223,22 +223,6 @@ def spread_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
     # The starts are fixed, so that validation losses of two trainings are comparable.
     starts = jnp.repeat(jnp.asarray([0, (steps - length) // 2, steps - length]), count)
     return windows(trajectories, rows, starts, length=length)
-
-
-def check_on_path(trajectories: Trajectory) -> None:
-    """Refuse runs in path coordinates that left the range where these are meaningful.
-
-    Raises:
-        ValueError: at a step of a run 1 − κ e_y ≤ 0.2, or a state is not finite.
-    """
-    lateral = trajectories.states[..., :-1, BODY.start]
-    valid = jnp.all(is_valid(lateral, trajectories.controls[..., 2]), axis=-1)
-    valid &= jnp.all(jnp.isfinite(trajectories.states), axis=(-2, -1))
-    if not bool(jnp.all(valid)):
-        raise ValueError(
-            f"{int(jnp.sum(~valid))} of {valid.size} runs left their path "
-            "(1 - kappa e_y <= 0.2): dataset.law does not stabilise the car"
-        )
 
 
 def coverage(

@@ -17,12 +17,13 @@ from sfkd_jax.data._schedules import (
     planned_segments,
     schedules_along_path,
 )
-from sfkd_jax.geometry import path_state
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import CURVATURE, LATERAL, is_valid
 from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.scenarios import DRIVES, DriveClass, random_drive
-from sfkd_jax.types import Control, Environment, Key, State, Trajectory
+from sfkd_jax.types import BODY, Control, Environment, Key, State, Trajectory
 
 Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
 """Maps (key, path state, w, e) to what the noise of its sensors makes the law add to ν.
@@ -147,7 +148,7 @@ def drive_along_path(
         beside = jax.random.uniform(start_key, (3,), minval=-1.0) * jnp.asarray(offset)
         # The offset of the speed is relative to the reference speed.
         beside = beside.at[2].add(speeds[0])
-        start = path_state(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside))
+        start = without_pose(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside))
 
         def step(
             state: State, inputs: tuple[Control, Environment, Key]
@@ -200,3 +201,19 @@ def _perturbations(
     # Jumping between the two limits is the worst that a planner may do.
     is_bang_bang = jax.random.uniform(choice_key) < BANG_BANG_SHARE
     return size * jnp.where(is_bang_bang, jnp.sign(noise), noise)
+
+
+def check_on_path(trajectories: Trajectory) -> None:
+    """Refuse runs in path coordinates that left the range where these are meaningful.
+
+    Raises:
+        ValueError: at a step of a run 1 − κ e_y ≤ 0.2, or a state is not finite.
+    """
+    lateral = trajectories.states[..., :-1, BODY][..., LATERAL]
+    valid = jnp.all(is_valid(lateral, trajectories.controls[..., CURVATURE]), axis=-1)
+    valid &= jnp.all(jnp.isfinite(trajectories.states), axis=(-2, -1))
+    if not bool(jnp.all(valid)):
+        raise ValueError(
+            f"{int(jnp.sum(~valid))} of {valid.size} runs left their path "
+            "(1 - kappa e_y <= 0.2): dataset.law does not stabilise the car"
+        )

@@ -18,7 +18,7 @@ from sfkd_jax.data._findings import more
 from sfkd_jax.data._log_files import fingerprint, log_files
 from sfkd_jax.data._logs import Columns, Log
 from sfkd_jax.data._reading import read_logs
-from sfkd_jax.geometry import PathState
+from sfkd_jax.path_coordinates import PathState
 from sfkd_jax.ranges import in_words
 from sfkd_jax.types import BODY, Control, Environment, Trajectory
 
@@ -86,7 +86,7 @@ def recorder(trained: Any, path: str | Path) -> Iterator[Callable[..., None]]:
                 *control,
                 *env[:env_size],
                 *shield.perturbation,
-                *info.path.road,
+                *info.path.inputs,
             ]
             file.write(",".join(f"{float(value):.12g}" for value in row) + "\n")
 

@@ -1,4 +1,4 @@
-"""Episodes in closed loop, with imperfect sensors and side forces; open-loop errors."""
+"""Episodes in closed loop, with imperfect sensors and side forces."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.evaluation.metrics import SIGNALS, Signal
-from sfkd_jax.geometry import (
+from sfkd_jax.info import reported
+from sfkd_jax.path_coordinates import (
     LATERAL,
     curvature_ahead,
     path_coordinates,
 )
-from sfkd_jax.info import reported
 from sfkd_jax.plants import Vehicle, equivalent_wind
 from sfkd_jax.ranges import Real
 from sfkd_jax.scenarios import (

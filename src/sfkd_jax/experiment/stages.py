@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from sfkd_jax import assembly, policy, store
 from sfkd_jax.certificate import (
     AxisNames,
-    Certificate,
     Corridor,
+    DrivingCertificate,
     Proof,
     Provenance,
     Refusal,
@@ -129,7 +129,7 @@ def _zero_law(sizes: _Sizes) -> PathLaw:
     )
 
 
-def certify_policy(run: Run) -> Certificate | Refusal:
+def certify_policy(run: Run) -> DrivingCertificate | Refusal:
     """Certify the policy of the run, and write and return the certificate."""
     began = time.perf_counter()
     settings = run.settings.certification
@@ -145,7 +145,7 @@ def certify_policy(run: Run) -> Certificate | Refusal:
         settings=_recorded_certification(settings),
     )
     try:
-        certificate: Certificate | Refusal = _certify(run, trained, provenance)
+        certificate: DrivingCertificate | Refusal = _certify(run, trained, provenance)
     except CertificationRefused as reason:
         certificate = Refusal(reason=str(reason), provenance=provenance)
     seconds = time.perf_counter() - began
@@ -153,13 +153,13 @@ def certify_policy(run: Run) -> Certificate | Refusal:
     certificate = dataclasses.replace(certificate, provenance=provenance)
     write(run.certificate_path, certificate, signing_key=settings.signing_key)
     store.print_message(f"certificate: {_verdict(certificate, settings)}")
-    if isinstance(certificate, Certificate) and certificate.proof.lyapunov_refused:
+    if not isinstance(certificate, Refusal) and certificate.proof.lyapunov_refused:
         store.print_message(f"certificate: {certificate.proof.lyapunov_refused}")
     return certificate
 
 
 def _verdict(
-    certificate: Certificate | Refusal, settings: CertificationSettings
+    certificate: DrivingCertificate | Refusal, settings: CertificationSettings
 ) -> str:
     """Return what a certificate proves and measures, in one line."""
     if isinstance(certificate, Refusal):
@@ -186,7 +186,7 @@ def _recorded_certification(settings: CertificationSettings) -> dict[str, Any]:
 
 def _certify(
     run: Run, trained: policy.TrainedModel, provenance: Provenance
-) -> Certificate:
+) -> DrivingCertificate:
     """Prove, and measure on the data of the run and on runs of its vehicle."""
     dataset = run.source.dataset
     settings = run.settings.certification
@@ -218,7 +218,7 @@ def _certify(
     # Logs have no plant to drive: a corridor needs runs under known conditions.
     if proof.outputs and run.source.logs is None:
         corridor = _measure_corridor(run, trained, proof)
-    return Certificate(
+    return DrivingCertificate(
         proof=proof,
         measured=measured,
         corridor=corridor,

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import between, circle_errors, compose
+from sfkd_jax.geometry import between, compose
 from sfkd_jax.models._lift import Lift
+from sfkd_jax.path_coordinates import circle_errors
 from sfkd_jax.types import (
     BODY,
     POSE,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import compose, path_state
+from sfkd_jax.geometry import compose, without_pose
 from sfkd_jax.models._state_model import state_model
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import (
@@ -191,7 +191,7 @@ class Planning:
         """Return F at ρ as (s, ν) ↦ s⁺, and s and ν of a system on its reference."""
 
         def certified(body: BodyState, nu: Control) -> BodyState:
-            return self._certified(fiber, path_state(body), jnp.append(nu, rho))[BODY]
+            return self._certified(fiber, without_pose(body), jnp.append(nu, rho))[BODY]
 
         size = self.space.body_mean.shape[0]
         return certified, (self.certified.frame.following(rho, size), jnp.zeros(FREE))
@@ -264,7 +264,7 @@ def _encode(fiber: PlanningFiber, state: State) -> Float[Array, " _"]:
 
 def _decode(fiber: PlanningFiber, latent: Float[Array, " _"]) -> State:
     """Return the state of (s, 1)."""
-    return path_state(latent[:-1])
+    return without_pose(latent[:-1])
 
 
 def _observe(

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 import jax.numpy as jnp
 
-from sfkd_jax.geometry import (
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import (
     CURVATURE,
     PERTURBATION,
     REFERENCE_SPEED,
     PathFeedback,
-    path_state,
     path_step,
 )
 from sfkd_jax.plants._variables import (
@@ -49,7 +49,7 @@ def step_with_law(
         wanted = law(state[BODY], curvature, inputs[REFERENCE_SPEED], env)
         # The actuator limits the sum, so the clip comes after the perturbation.
         control = jnp.clip(wanted + inputs[PERTURBATION], bottom, top)
-        return path_state(along(state[BODY], control, curvature, env))
+        return without_pose(along(state[BODY], control, curvature, env))
 
     return closed
 
@@ -62,9 +62,9 @@ def along_path(
 ) -> Vehicle:
     """Return the closed loop as a plant with states (0, 0, 0, ξ) and controls w.
 
-    w = (ν, κ, v_ref), see `sfkd_jax.geometry`. One step is exact on a circle of
+    w = (ν, κ, v_ref), see `path_coordinates`. One step is exact on a circle of
     curvature κ, whatever the step of the vehicle is. Where 1 − κ e_y ≤ 0.2 the result
-    is finite but not meaningful; `geometry.is_valid` tests for it.
+    is finite but not meaningful; `path_coordinates.is_valid` tests for it.
 
     Args:
         vehicle: with limits of its controls.

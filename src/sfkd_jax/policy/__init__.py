@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import assembly, store
-from sfkd_jax.certificate import Certificate, describe_signature
+from sfkd_jax.certificate import DrivingCertificate, describe_signature
 from sfkd_jax.control import in_the_world
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
@@ -52,7 +52,7 @@ class Policy(TrainedModel):
     """
 
     controller: Controller
-    certificate: Certificate | None
+    certificate: DrivingCertificate | None
     signature: str
     around: Callable[..., Controller]
 
@@ -65,7 +65,7 @@ class Policy(TrainedModel):
         """Say what it drives, where its certificate applies, and what is proved."""
         return describe(self, self.certificate, self.signature)
 
-    def _with_corridor(self) -> Certificate:
+    def _with_corridor(self) -> DrivingCertificate:
         """Return the certificate, or raise a ValueError if it has no corridor."""
         if self.certificate is None or self.certificate.corridor is None:
             raise ValueError(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sfkd_jax import certificate as certificates
 from sfkd_jax import store
-from sfkd_jax.certificate import Certificate, Refusal
+from sfkd_jax.certificate import DrivingCertificate, Refusal
 from sfkd_jax.policy._trained import TrainedModel, policy_file
 
 CERTIFICATE = "certificate.json"
@@ -19,7 +19,7 @@ where both exist.
 
 def read_certificate(
     path: str | Path, trained: TrainedModel, *, signed_by: str | Path | None = None
-) -> tuple[Certificate | None, str]:
+) -> tuple[DrivingCertificate | None, str]:
     """Verify the certificate beside a policy, in its run directory.
 
     Args:
@@ -42,7 +42,7 @@ def read_certificate(
         if signed_by is not None:
             raise store.failure(files[-1], "is missing, and was to be signed")
         return None, f"{CERTIFICATE} is missing"
-    certificate = certificates.read(file)
+    certificate = certificates.read(file, DrivingCertificate)
     if signed_by is not None:
         _require_signature(file, certificate, signed_by)
     if isinstance(certificate, Refusal):
@@ -53,7 +53,7 @@ def read_certificate(
         _require_signature(file, certificate, certificate.signature.public_key)
     try:
         with store.as_artefact_error(file):
-            certification.verify(certificate, trained)
+            certification.verify_driving(certificate, trained)
     except certification.CertificateStale as reason:
         if signed_by is not None:
             raise store.failure(file, reason) from None
@@ -64,7 +64,7 @@ def read_certificate(
 
 
 def _require_signature(
-    file: Path, certificate: Certificate | Refusal, signer: str | Path
+    file: Path, certificate: DrivingCertificate | Refusal, signer: str | Path
 ) -> None:
     """Raise an ArtefactError unless a certificate is signed by a key."""
     key = certificates.public_key_of(signer)

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import assembly
-from sfkd_jax.certificate import Certificate, Conditions
+from sfkd_jax.certificate import Conditions, DrivingCertificate
 from sfkd_jax.plants import axes
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
 
 
 def interface_of(
-    trained: TrainedModel, certificate: Certificate | None
+    trained: TrainedModel, certificate: DrivingCertificate | None
 ) -> dict[str, Any]:
     """Return names, units and limits of controls, observation, e and reference."""
     vehicle = trained.vehicle
@@ -40,7 +40,7 @@ def interface_of(
 
 
 def describe(
-    trained: TrainedModel, certificate: Certificate | None, signature: str
+    trained: TrainedModel, certificate: DrivingCertificate | None, signature: str
 ) -> str:
     """Return what a policy drives, where its certificate applies, what is proved.
 
@@ -75,7 +75,7 @@ def describe(
     return "\n  ".join(lines)
 
 
-def _certified_box(certificate: Certificate, trained: TrainedModel) -> str:
+def _certified_box(certificate: DrivingCertificate, trained: TrainedModel) -> str:
     """Return the line about the states for which the certificate is stated."""
     boxes = certificate.measured.boxes
     low, high = boxes.state
@@ -92,7 +92,7 @@ def _certified_box(certificate: Certificate, trained: TrainedModel) -> str:
 
 
 def _certified_facts(
-    certificate: Certificate, signature: str, env_names: list[str]
+    certificate: DrivingCertificate, signature: str, env_names: list[str]
 ) -> Iterator[str]:
     """Yield the lines about what is proved and what is only measured."""
     alpha = certificate.proof.alpha

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sfkd_jax import store
-from sfkd_jax.certificate import Certificate, read
+from sfkd_jax.certificate import DrivingCertificate, read
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """A folder for each shipped policy, as `train` wrote it."""
@@ -51,8 +51,8 @@ def shipped_names() -> list[str]:
 
 def _summary(folder: Path) -> ShippedPolicy:
     """Read the summary of one policy from its certificate."""
-    certificate = read(folder / "certificate.json")
-    assert isinstance(certificate, Certificate)
+    certificate = read(folder / "certificate.json", DrivingCertificate)
+    assert isinstance(certificate, DrivingCertificate)
     env_low, env_high = certificate.measured.boxes.env
     corridor = certificate.corridor
     return ShippedPolicy(

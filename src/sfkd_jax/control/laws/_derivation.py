@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.geometry import LATERAL, PATH_SPEED, path_step
+from sfkd_jax.path_coordinates import LATERAL, PATH_SPEED, path_step
 from sfkd_jax.ranges import AtLeastTwo, Positive, Span
 from sfkd_jax.types import Control, Scalar, Step
 
@@ -52,11 +52,12 @@ def derive_path_law(
 
         ξ* = F(ξ*, u*; κ, e),   e_y* = 0,   v* = v_ref
 
-    F is the vehicle's step in path coordinates, see `geometry.path_step`; K solves
-    the Riccati equation of F linearised at ξ*. Derivatives are finite differences, so
-    the step may be any function, such as a simulator on the host. Newton's method
-    starts every turn from that of the next smaller |κ|. If it does not converge (too
-    fast for the friction), the turn and gain of the smaller curvature are used.
+    F is the vehicle's step in path coordinates, see `path_coordinates.path_step`; K
+    solves the Riccati equation of F linearised at ξ*. Derivatives are finite
+    differences, so the step may be any function, such as a simulator on the host.
+    Newton's method starts every turn from that of the next smaller |κ|. If it does not
+    converge (too fast for the friction), the turn and gain of the smaller curvature are
+    used.
 
     Args:
         step: (x, u, e) -> x one sampling period later.

@@ -106,7 +106,8 @@ def path_errors(
     """Return the errors relative to the circle that touches the path at `point`.
 
     They are exact to second order in the distance along the circle, and cheaper than
-    those of `geometry.circle_errors`. A planner needs them thousands of times a step.
+    those of `path_coordinates.circle_errors`. A planner needs them thousands of times a
+    step.
 
     Args:
         state: p_x, p_y, yaw, v, ….

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.control.laws._steady_turn import SteadyTurn
-from sfkd_jax.geometry import PATH_SPEED, PathState, put
+from sfkd_jax.geometry import put
+from sfkd_jax.path_coordinates import PATH_SPEED, PathState
 from sfkd_jax.ranges import Positive
 from sfkd_jax.types import Control, Environment, Scalar
 

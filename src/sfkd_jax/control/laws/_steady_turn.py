@@ -14,14 +14,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import (
-    HEADING,
-    LATERAL,
-    PATH_SPEED,
-    PathState,
-    entrywise,
-    wrap_angle,
-)
+from sfkd_jax.geometry import entrywise, wrap_angle
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.types import Control, Scalar
 
 NEAR = (0.45, 0.12, 3.0)

@@ -31,7 +31,7 @@ from sfkd_jax.control.tasks._task import (
     StepResult,
     Task,
 )
-from sfkd_jax.geometry import beside, followable, reference_curvature
+from sfkd_jax.path_coordinates import beside, followable, reference_curvature
 from sfkd_jax.ranges import AtLeastTwo
 from sfkd_jax.types import (
     BODY,

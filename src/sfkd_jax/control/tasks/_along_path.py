@@ -28,21 +28,19 @@ from sfkd_jax.control.tasks._task import (
     StepResult,
     Task,
 )
-from sfkd_jax.geometry import (
+from sfkd_jax.geometry import between, entrywise, without_pose
+from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
+from sfkd_jax.path_coordinates import (
     HEADING,
     LATERAL,
     PATH_FRAME,
     PATH_SPEED,
     PathState,
     beside,
-    between,
     curvature_ahead,
-    entrywise,
     followable,
     path_coordinates,
-    path_state,
 )
-from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -102,7 +100,7 @@ class AlongReference(Stateful):
     This is the only place where a state is projected onto the path, once per control
     step. Predicted states are mapped back beside the points of the reference.
 
-    `info` gains `path`, see `PathInfo`; its ξ and road are NaN if the observation or
+    `info` gains `path`, see `PathInfo`; its ξ and inputs are NaN if the observation or
     the reference is not finite.
 
     Attributes:
@@ -166,7 +164,7 @@ class AlongReference(Stateful):
         seen = jnp.where(measured, xi, jnp.nan)
         info = info._replace(
             claim=info.claim.under(preview.reason),
-            path=PathInfo(xi=seen, road=road[0], planned=planned),
+            path=PathInfo(xi=seen, inputs=road[0], planned=planned),
         )
         return control, AlongReferenceState(inner, observation), info
 
@@ -233,7 +231,7 @@ class FollowingLaw(LawTask):
         law_control = jnp.clip(first_turn.feedback(xi), low, high)
         # Before the first step no control was applied: slew limits count from the law.
         before = jnp.where(previous.known, previous.control, law_control)
-        latent = self.model.encode(fiber, path_state(xi))
+        latent = self.model.encode(fiber, without_pose(xi))
         start = Sample(latent, xi, before)
         fibers = None
         if self.model.on_reference is not None:

@@ -31,7 +31,8 @@ from sfkd_jax.control.tasks._task import (
     Task,
     actuator_limits,
 )
-from sfkd_jax.geometry import entrywise, followable, is_precise, reference_curvature
+from sfkd_jax.geometry import entrywise, is_precise
+from sfkd_jax.path_coordinates import followable, reference_curvature
 from sfkd_jax.ranges import Positive
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (

@@ -14,8 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import factory
-from sfkd_jax.geometry import entrywise
-from sfkd_jax.lanes import outside_box
+from sfkd_jax.geometry import entrywise, outside_box
 from sfkd_jax.types import Control, Params, Scalar
 
 Limiter: TypeAlias = Callable[[Control, Control], Control]

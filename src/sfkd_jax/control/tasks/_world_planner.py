@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, compose
+from sfkd_jax.geometry import compose
 from sfkd_jax.info import ControllerInfo, reported
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.rollout import Offset
 from sfkd_jax.types import (
     POSE,

@@ -27,8 +27,9 @@ from sfkd_jax.control.wrappers._estimator import (
     transition_matrix,
 )
 from sfkd_jax.control.wrappers._innovations import expected_coordinates
-from sfkd_jax.geometry import LATERAL, PATH_FRAME, PATH_SPEED, PathState, path_state
+from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import AdaptationInfo, ControllerInfo, reported
+from sfkd_jax.path_coordinates import LATERAL, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.ranges import (
     AtLeastTwo,
     Fraction,
@@ -330,5 +331,5 @@ def _compensation(
     # The model was not learned beyond what data and planners add to the law.
     largest = 2.0 * loop.law.perturbation[0]
     steering = jnp.clip(jnp.nan_to_num(steering), -largest, largest)
-    shift = (path_state(xi), path_state(shifted))
+    shift = (without_pose(xi), without_pose(shifted))
     return Offset(params, jnp.zeros(4).at[0].set(steering), shift)

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.geometry import LATERAL, PathState, is_valid
+from sfkd_jax.path_coordinates import LATERAL, PathState, is_valid
 from sfkd_jax.types import Environment
 
 Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]

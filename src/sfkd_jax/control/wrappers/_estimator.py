@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.wrappers._innovations import expected_coordinates
-from sfkd_jax.geometry import PathState
+from sfkd_jax.path_coordinates import PathState
 from sfkd_jax.types import Control, Environment, Model, Params, Scalar
 
 FRICTION = 0

@@ -36,8 +36,9 @@ from sfkd_jax.control.wrappers._plausibility import (
     Plausibility,
     difference,
 )
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, put
+from sfkd_jax.geometry import put
 from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first, reported
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (

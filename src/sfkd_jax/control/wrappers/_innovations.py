@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, path_state
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.types import BODY, Control, Environment, Fiber, Model, Scalar
 
 WINDOWS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
@@ -115,7 +116,7 @@ def expected_coordinates(
     model: Model, fiber: Fiber, xi: PathState, nu: Control, road: Float[Array, " 2"]
 ) -> PathState:
     """Return the ξ that the nominal model expects one step after a measured one."""
-    latent = model.encode(fiber, path_state(xi))
+    latent = model.encode(fiber, without_pose(xi))
     after = model.step(fiber, latent, jnp.concatenate([nu, road]))
     return model.decode(fiber, after)[BODY]
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool
 from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._conditions import Conditions
-from sfkd_jax.geometry import LATERAL, PathState, path_state
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.path_coordinates import LATERAL, PathState
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -97,7 +98,7 @@ class NominalModel(NamedTuple):
 
         def encode(params: Params) -> Latent:
             fiber = self.model.fiber(params, jnp.zeros(environment))
-            return self.model.encode(fiber, path_state(jnp.zeros(size)))
+            return self.model.encode(fiber, without_pose(jnp.zeros(size)))
 
         # Only shapes are evaluated.
         latent = jax.eval_shape(encode, jax.eval_shape(self.model.init, key))
@@ -136,7 +137,7 @@ class NominalModel(NamedTuple):
             return model.transport(old, fiber, before.latent)
 
         latent = jax.lax.cond(jnp.all(inside == before.env), unchanged, transported)
-        anchor = model.encode(fiber, path_state(xi))
+        anchor = model.encode(fiber, without_pose(xi))
         readable = all_finite((anchor, law_control))
         compared = before.started & preview.measured[LATERAL]
         distance = jnp.abs(xi - model.decode(fiber, latent)[BODY])[LATERAL]

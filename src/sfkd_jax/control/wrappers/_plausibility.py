@@ -14,7 +14,8 @@ from sfkd_jax.control._finite import all_finite
 from sfkd_jax.control.tasks._along_path import Preview
 from sfkd_jax.control.wrappers._conditions import Box
 from sfkd_jax.control.wrappers._innovations import InnovationState
-from sfkd_jax.geometry import HEADING, LATERAL, PATH_SPEED, PathState, put, wrap_angle
+from sfkd_jax.geometry import put, wrap_angle
+from sfkd_jax.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.types import Environment, Scalar
 
 MOVING = 0.3

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control.laws._path_law import PathLaw
 from sfkd_jax.control.wrappers._conditions import Conditions
-from sfkd_jax.geometry import HEADING, PATH_SPEED, PathState
+from sfkd_jax.path_coordinates import HEADING, PATH_SPEED, PathState
 from sfkd_jax.types import Scalar
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._finite import all_finite
-from sfkd_jax.geometry import LATERAL
+from sfkd_jax.path_coordinates import LATERAL
 from sfkd_jax.types import BODY, Control, Fiber, Latent, Model, Scalar
 
 FILTER_SCALES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)

@@ -26,8 +26,8 @@ from sfkd_jax.control.wrappers._conditions import ANYWHERE, Box, Conditions, che
 from sfkd_jax.control.wrappers._nominal import Comparison, NominalModel, ShieldState
 from sfkd_jax.control.wrappers._rolling import RollingCorridor
 from sfkd_jax.control.wrappers._safety_filter import FilterResult, safety_filter
-from sfkd_jax.geometry import HEADING, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
+from sfkd_jax.path_coordinates import HEADING, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
 from sfkd_jax.types import (
     Control,
