@@ -2,8 +2,15 @@
 
 import hashlib
 import json
+from functools import cache
 
-from sfkd_jax import policy
+from sfkd_jax import policy, store
+from sfkd_jax.certificate import DrivingCertificate, parse
+from sfkd_jax.certification import (
+    CertificateStale,
+    CertificationRefused,
+    verify_driving,
+)
 
 
 def hashed(changed):
@@ -20,3 +27,25 @@ def policy_copy(folder, name):
     for file in (policy.SHIPPED / name).iterdir():
         (run / file.name).write_bytes(file.read_bytes())
     return run
+
+
+@cache
+def shipped(name):
+    return policy.restore(name)
+
+
+@cache
+def document(name):
+    return store.read_json(policy.SHIPPED / name / "certificate.json")
+
+
+def refusal(changed, name):
+    """Why a document is refused, in one line; None if it is accepted."""
+    try:
+        verify_driving(parse(changed, DrivingCertificate), shipped(name))
+    except (ValueError, CertificationRefused, CertificateStale) as reason:
+        line = str(reason)
+    else:
+        return None
+    assert "\n" not in line
+    return line
