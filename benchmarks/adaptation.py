@@ -16,10 +16,11 @@ import numpy as np
 
 from benchmarks import arguments, stamp, write
 from benchmarks.device import CARS, SETTLED, SHIPPED, driving, family, rmse_mm
-from sfkd_jax import assembly, plants, policy
-from sfkd_jax.evaluation.metrics import room_in_lane
-from sfkd_jax.plants import equivalent_wind
-from sfkd_jax.scenarios import random_side_forces
+from sfkd_jax import assembly, policy
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.plants import equivalent_wind
+from sfkd_jax.driving.scenarios import random_side_forces
+from sfkd_jax.driving.simulation.metrics import room_in_lane
 
 
 class Case(NamedTuple):

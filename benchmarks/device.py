@@ -23,7 +23,7 @@ import numpy as np
 
 import sfkd_jax
 from benchmarks import arguments, stamp
-from sfkd_jax import evaluation, scenarios
+from sfkd_jax.driving import paths, scenarios, simulation
 
 SHIPPED = Path(sfkd_jax.__file__).with_name("pretrained")
 CARS = ("dynamic", "kinematic")
@@ -88,7 +88,7 @@ def driving(plant, controller, params, **options):
         "observation_noise": plant.sensor_noise,
         "size": plant.size,
     } | options
-    return partial(evaluation.simulate, plant.step, controller, params, **options)
+    return partial(simulation.simulate, plant.step, controller, params, **options)
 
 
 def fresh_episodes(policy, scenario, duration):
@@ -120,7 +120,7 @@ def control_step(name, steps, *, vehicles=1, at_once=1, **changes):
     horizon = policy.interface["horizon"]
     steps = max(steps // vehicles, 10)
     episode = jax.jit(family(policy.vehicle, "s3", 15.0))(keys)
-    ahead = scenarios.reference_window(
+    ahead = paths.reference_window(
         episode.path, jnp.zeros(()), episode.speed, dt=PERIOD, horizon=horizon
     )
     seen = episode.initial_state, episode.envs[0], ahead

@@ -21,8 +21,9 @@ import numpy as np
 from benchmarks import arguments, as_lines, device, search, stamp, total
 from benchmarks.device import CARS, HORIZON, PERIOD, driving
 from benchmarks.recovery import shown
-from sfkd_jax import control, models, scenarios
-from sfkd_jax.lanes import circles, clearance
+from sfkd_jax import control, models
+from sfkd_jax.driving import path_following, paths, scenarios
+from sfkd_jax.driving.lanes import circles, clearance
 from sfkd_jax.types import Controller
 
 STEPS = 600
@@ -53,10 +54,10 @@ class Car:
         """A controller of scenes, whose params are those of the policy."""
         if name == "lane":
             return self.policy.in_lane()
-        task = control.path_tracking(
+        task = path_following.path_tracking(
             models.physics(self.plant.step),
-            control.tracking_cost(dt=PERIOD),
-            control.path_feedback(wheelbase=self.plant.wheelbase),
+            path_following.tracking_cost(dt=PERIOD),
+            path_following.path_feedback(wheelbase=self.plant.wheelbase),
             dt=PERIOD,
             control_low=self.plant.control_low,
             control_high=self.plant.control_high,
@@ -78,7 +79,7 @@ class Car:
         def run(scenario, key):
             made = episode(scenario, key)
             # From the middle of the road, also where another reference is followed.
-            foot = jax.vmap(scenarios.point_at, (None, 0))(scenario.path, made.progress)
+            foot = jax.vmap(paths.point_at, (None, 0))(scenario.path, made.progress)
             away = made.states[1:, :2] - foot[:, :2]
             yaw = foot[:, 2]
             middle = away[:, 1] * jnp.cos(yaw) - away[:, 0] * jnp.sin(yaw)
@@ -124,8 +125,8 @@ def on_road(controller):
     def act(params, memory, seen, env, scene):
         lane, obstacles = scene
         along, inner = memory
-        along, _ = scenarios.project(lane.path, seen[:2], along + 1.0)
-        ahead = scenarios.reference_window(
+        along, _ = paths.project(lane.path, seen[:2], along + 1.0)
+        ahead = paths.reference_window(
             lane.path, along, lane.speed[0], dt=PERIOD, horizon=HORIZON
         )
         present = obstacles.present.astype(float)

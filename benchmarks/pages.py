@@ -13,6 +13,7 @@ from benchmarks.tables import Measured, measured, table
 from experiments import results
 from experiments.simulator import PREFIXES
 from sfkd_jax import certificate, store
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 CARS = ("dynamic", "kinematic")
 NONE = "–"
@@ -68,9 +69,7 @@ def claims():
     found = []
     for car in CARS:
         folder = PRETRAINED / policy_of(car)
-        claimed = certificate.read(
-            folder / "certificate.json", certificate.DrivingCertificate
-        )
+        claimed = certificate.read(folder / "certificate.json", DrivingCertificate)
         _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
         about = claimed.corridor
         numbers = {

@@ -19,11 +19,19 @@ from scipy.signal import lfilter
 
 from benchmarks import arguments, device, stamp, write
 from benchmarks.device import CARS, HORIZON, PERIOD
-from sfkd_jax import control, geometry, plants, scenarios
-from sfkd_jax.evaluation.metrics import room_in_lane
+from sfkd_jax import geometry
+from sfkd_jax.driving import path_following, plants, scenarios
+from sfkd_jax.driving.path_coordinates import LATERAL
+from sfkd_jax.driving.paths import (
+    Path,
+    path_from_curvature,
+    point_at,
+    project,
+    reference_window,
+)
+from sfkd_jax.driving.simulation.metrics import room_in_lane
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.info import ControllerInfo, PlanInfo
-from sfkd_jax.path_coordinates import LATERAL
 from sfkd_jax.types import Controller
 
 SPACING = 0.5
@@ -131,7 +139,7 @@ class Car:
             # The shield is made of numbers, also while a program is traced.
             with jax.ensure_compile_time_eval():
                 return self.loaded.shield(planner, along_path=True)
-        return control.along_reference(planner, coordinates=law.gain.shape[-1])
+        return path_following.along_reference(planner, coordinates=law.gain.shape[-1])
 
     def program(self, make):
         """(runs) -> what is recorded of every call, (run, time, …)."""
@@ -176,21 +184,19 @@ def foot_of(path, position, before):
     first = jnp.clip((before / SPACING).astype(int) - NEAR, 0, last)
     near = jax.lax.dynamic_slice_in_dim(path.points, first, 2 * NEAR)
     best = jnp.argmin(jnp.sum((near[:, :2] - position) ** 2, axis=1))
-    return scenarios.project(path, position, SPACING * (first + best))
+    return project(path, position, SPACING * (first + best))
 
 
 def part_of_run(car, make, runs, carry):
     """`PART` calls of one run, whose arrays have lost their first axis."""
-    path = scenarios.Path(runs.road, jnp.asarray(SPACING))
+    path = Path(runs.road, jnp.asarray(SPACING))
     key = jax.random.key(runs.seed + 1)
 
     def step(carry, now):
         number, state, foot, memory, past = carry
         foot, left = foot_of(path, state[:2], foot)
-        yaw = scenarios.point_at(path, foot)[2]
-        ahead = scenarios.reference_window(
-            path, foot, now.speed, dt=PERIOD, horizon=HORIZON
-        )
+        yaw = point_at(path, foot)[2]
+        ahead = reference_window(path, foot, now.speed, dt=PERIOD, horizon=HORIZON)
         normals = jnp.stack([-jnp.sin(ahead[:, 2]), jnp.cos(ahead[:, 2])], axis=1)
         ahead = ahead.at[:, :2].add(now.aside * normals)
         fresh = jax.random.normal(jax.random.fold_in(key, number), state.shape)
@@ -237,7 +243,7 @@ def roads(count, seed, conditions=None, bends=None):
     if conditions is not None:
         envs = np.asarray(jax.jit(jax.vmap(conditions))(keys))
     if bends is not None:
-        bent = partial(scenarios.path_from_curvature, spacing=SPACING)
+        bent = partial(path_from_curvature, spacing=SPACING)
         turns = bends * np.ones(points.shape[:2])
         points = np.asarray(jax.jit(jax.vmap(lambda one: bent(one).points))(turns))
     return points, envs

@@ -21,13 +21,7 @@ import jax.numpy as jnp
 from brax import envs
 
 from sfkd_jax import adapters, certification, control, models
-from sfkd_jax.data import (
-    Dataset,
-    measure_space,
-    random_windows,
-    split,
-    spread_windows,
-)
+from sfkd_jax.data import Dataset, measure_space, random_windows, split, spread_windows
 from sfkd_jax.rollout import fold
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import BODY, Controller, Params, Trajectory

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 
 import sfkd_jax
-from sfkd_jax import assembly, evaluation, scenarios
+from sfkd_jax import assembly
+from sfkd_jax.driving import scenarios, simulation
 from sfkd_jax.report import film as films
 
 SECONDS = 60.0
@@ -49,7 +50,7 @@ def compile_drive(policy):
     sensor_noise = policy.certificate.corridor.conditions.sensor_noise
 
     def drive(scene, key):
-        return evaluation.simulate(
+        return simulation.simulate(
             plant.step,
             controller,
             policy.params,

@@ -17,13 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sfkd_jax import certification, control, models
-from sfkd_jax.data import (
-    Dataset,
-    measure_space,
-    random_windows,
-    split,
-    spread_windows,
-)
+from sfkd_jax.data import Dataset, measure_space, random_windows, split, spread_windows
+from sfkd_jax.driving import path_following
 from sfkd_jax.rollout import rollout
 from sfkd_jax.training import fit, multi_step_loss
 from sfkd_jax.types import Trajectory
@@ -94,10 +89,10 @@ def train(data: Dataset, steps: int, directory: Path):
 
 def build_planner(model, controls):
     """Return MPPI with the learned model, within the controls that were logged."""
-    task = control.path_tracking(
+    task = path_following.path_tracking(
         model,
-        control.tracking_cost(dt=DT),
-        control.no_feedback(),
+        path_following.tracking_cost(dt=DT),
+        path_following.no_feedback(),
         dt=DT,
         control_low=tuple(controls.min((0, 1)).tolist()),
         control_high=tuple(controls.max((0, 1)).tolist()),

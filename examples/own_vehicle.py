@@ -10,7 +10,8 @@ planner samples around. The program prints the RMS distance from the path.
 import jax
 import jax.numpy as jnp
 
-from sfkd_jax import control, evaluation, models, scenarios
+from sfkd_jax import control, models
+from sfkd_jax.driving import path_following, scenarios, simulation
 
 DT = 0.1  # control period [s]
 TRACK = 0.6  # distance of the wheels [m]
@@ -44,9 +45,9 @@ def law(errors, curvature, speed):
 
 def main(samples: int = 256, seconds: float = 15.0) -> float:
     """Return the RMS distance from the path over an episode [m]."""
-    task = control.path_tracking(
+    task = path_following.path_tracking(
         models.physics(step),
-        control.tracking_cost(dt=DT, steering_rate=0.1),
+        path_following.tracking_cost(dt=DT, steering_rate=0.1),
         law,
         dt=DT,
         control_low=(-1.0, -2.0),
@@ -60,7 +61,7 @@ def main(samples: int = 256, seconds: float = 15.0) -> float:
     @jax.jit
     def run(road_key, drive_key):
         road = draw_road(road_key)
-        return evaluation.simulate(
+        return simulation.simulate(
             step, planner, {}, road, drive_key, dt=DT, horizon=HORIZON
         ).lateral
 

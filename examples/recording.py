@@ -8,11 +8,12 @@ A car is any simulator of `vehicle=simulator` (`highway.py` is one): it has `dt`
 import jax
 import numpy as np
 
-from sfkd_jax import control
-from sfkd_jax.data import recorder
-from sfkd_jax.scenarios import project, reference_window, smooth_path
+from sfkd_jax.driving import path_following
+from sfkd_jax.driving.logs import recorder
+from sfkd_jax.driving.paths import project, reference_window
+from sfkd_jax.driving.scenarios import smooth_path
 
-path_errors = jax.jit(control.path_errors)
+path_errors = jax.jit(path_following.path_errors)
 project_on_path = jax.jit(project)
 window_ahead = jax.jit(reference_window, static_argnames=("dt", "horizon"))
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks import stamp
 from sfkd_jax import certificate
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 PREFIXES = {
     "nominal": "nominal_mppi_",
@@ -27,9 +28,7 @@ PREFIXES = {
 def main():
     """Print the line."""
     runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
-    claimed = certificate.read(
-        runs[0] / "certificate.json", certificate.DrivingCertificate
-    )
+    claimed = certificate.read(runs[0] / "certificate.json", DrivingCertificate)
     corridor = claimed.corridor
     found = {
         "corridor_m": corridor.corridor_m,

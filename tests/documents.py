@@ -5,12 +5,10 @@ import json
 from functools import cache
 
 from sfkd_jax import policy, store
-from sfkd_jax.certificate import DrivingCertificate, parse
-from sfkd_jax.certification import (
-    CertificateStale,
-    CertificationRefused,
-    verify_driving,
-)
+from sfkd_jax.certificate import parse
+from sfkd_jax.certification import CertificateStale, CertificationRefused
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.corridor import verify_driving
 
 
 def hashed(changed):

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from safetensors.numpy import save
 
-from sfkd_jax import certification, control, models, plants, store
+from sfkd_jax import certification, models, paper, store
 from sfkd_jax import data as datasets
-from sfkd_jax.path_coordinates import PATH_FRAME
+from sfkd_jax.driving import drives, path_coordinates, path_following, plants
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.types import Space, Trajectory
 
 jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -67,7 +68,8 @@ HARD = ("sfkd", "no_fiber", "no_transport")
 there).
 """
 PHYSICS = ("oracle", "nominal")
-OTHERS = tuple(name for name in models.FACTORIES if name != "sfkd")
+FACTORIES = models.FACTORIES | paper.MODELS
+OTHERS = tuple(name for name in FACTORIES if name != "sfkd")
 """Other learned models, with their default settings."""
 
 
@@ -103,7 +105,7 @@ def any_law(coordinates=3):
     gain[..., 0, :2], gain[..., 1, 2] = (0.05, 0.5), 1.0
     turn = np.zeros((*corners, 2), np.float32)
     turn[0, ..., 0], turn[1, ..., 0] = -0.06, 0.06
-    return control.PathLaw(
+    return path_following.PathLaw(
         low=jnp.asarray([-2.0, 8.0, 0.3, -8.0]),
         high=jnp.asarray([2.0, 10.5, 0.9, 8.0]),
         perturbation=jnp.asarray([0.03, 1.0]),
@@ -135,7 +137,7 @@ def _model(name):
     """Return one object per variant, so that it is compiled once."""
     if name not in OTHERS:
         return tiny(name)
-    factory, known = models.FACTORIES[name], {}
+    factory, known = FACTORIES[name], {}
     if "nominal" in inspect.signature(factory).parameters:
         known = {"nominal": plants.kinematic().nominal_derivative}
     return factory(space(), **known)
@@ -206,12 +208,14 @@ def driven(count=3, steps=12):
 
 def driver(plant):
     """The path-following law that drives while data are collected."""
-    law = control.path_feedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+    law = path_following.path_feedback(
+        wheelbase=plant.wheelbase, speed_loop=plant.speed_loop
+    )
 
     def follow(state, reference):
-        curvature = control.reference_curvature(reference)[0]
+        curvature = path_coordinates.reference_curvature(reference)[0]
         return law(
-            control.path_errors(state, reference[0], curvature),
+            path_following.path_errors(state, reference[0], curvature),
             curvature,
             reference[0, 3],
         )
@@ -224,7 +228,7 @@ def generator(count=120, steps=25):
     """key -> training segments of the kinematic plant, compiled once."""
     plant = plants.kinematic()
     return jit(
-        partial(datasets.generate, plant, driver(plant), segments=count, steps=steps)
+        partial(drives.generate, plant, driver(plant), segments=count, steps=steps)
     )
 
 
@@ -244,7 +248,7 @@ def dataset(count=120, steps=25):
         shares=SHARES,
         env_low=low,
         env_high=high,
-        scenarios=jnp.asarray(datasets.segment_scenarios(count)),
+        scenarios=jnp.asarray(drives.segment_scenarios(count)),
     )
 
 

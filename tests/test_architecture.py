@@ -16,56 +16,91 @@ FUNCTION = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src" / "sfkd_jax"
 PACKAGE = SRC.name
-CORE = {"info", "types", "geometry", "path_coordinates", "rollout", "ranges"}
-CORE |= {"paths", "lanes"}
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
-PLANT = CORE | {"plants", "scenarios"}
-PARTS = PLANT | {"control", "data"}
-ARROWS = {
+CORE = {"info", "types", "geometry", "rollout", "ranges"}
+GROUND = {
     "info": set(),
     "types": {"info"},
     "ranges": set(),
     "geometry": {"types"},
-    "path_coordinates": {"types", "geometry"},
     "rollout": {"types", "geometry"},
-    "paths": {"types"},
-    "lanes": {"types", "geometry", "paths"},
     "settings": {"ranges"},
     "store": set(),
     "certificate": {"ranges", "store"},
-    "plants": CORE,
-    "scenarios": CORE,
     "models": CORE,
     "control": CORE,
     "training": CORE | {"store"},
-    "data": PLANT | {"store"},
-    "evaluation": PLANT,
-    "certification": PARTS | {"certificate"},
-    "assembly": PARTS | {"certificate", "models", "settings", "store"},
-    "policy": PARTS | {"assembly", "certificate", "certification", "settings", "store"},
-    "export": CORE | {"assembly", "certificate", "policy", "settings", "store"},
+    "data": CORE,
+    "evaluation": CORE,
+    "certification": CORE | {"certificate", "data"},
+}
+"""The floor for any system with an environment: package -> what it may import."""
+ROAD = CORE | {f"driving.{name}" for name in ("path_coordinates", "paths", "lanes")}
+PLANT = ROAD | {"driving.plants", "driving.scenarios"}
+DRIVING = {
+    "driving": set(),
+    "driving.path_coordinates": {"types", "geometry"},
+    "driving.paths": {"types"},
+    "driving.lanes": {"types", "geometry", "driving.paths"},
+    "driving.plants": ROAD,
+    "driving.scenarios": ROAD,
+    "driving.path_following": ROAD | {"control"},
+    "driving.drives": PLANT | {"data", "store"},
+    "driving.logs": PLANT | {"data", "store"},
+    "driving.simulation": PLANT | {"evaluation"},
+    "driving.certificate": {"ranges", "store", "certificate"},
+    "driving.corridor": PLANT
+    | {"certificate", "certification", "control", "data"}
+    | {"driving.certificate", "driving.drives", "driving.path_following"},
+}
+"""The floor for vehicles along paths."""
+PAPER = {"paper": ROAD | {"control", "models", "driving.path_following"}}
+"""The floor of what only the paper needs."""
+FLOORS = (GROUND, DRIVING, PAPER)
+LIBRARIES = {name for floor in FLOORS for name in floor}
+PARTS = LIBRARIES - {"training", "evaluation", "driving.simulation"}
+APPLICATIONS = {
+    "assembly": PARTS - {"certification", "driving.corridor"},
+    "policy": PARTS | {"assembly"},
+    "export": ROAD
+    | {"assembly", "policy", "settings", "store"}
+    | {"certificate", "driving.certificate"},
     "adapters": PLANT | {"assembly"},
-    "report": {"assembly", "certificate", "evaluation", "plants", "store"},
+    "report": PLANT
+    | {"assembly", "evaluation", "driving.simulation", "store"}
+    | {"certificate", "driving.certificate"},
     "__init__": {"export", "geometry", "info", "policy", "store"},
 }
+"""What puts the floors together."""
+ARROWS = GROUND | DRIVING | PAPER | APPLICATIONS
 ARROWS |= {"experiment": set(ARROWS)}
 ARROWS |= {name: set(ARROWS) for name in COMMANDS}
+OF_CARS = ("lateral", "heading", "speed", "speeds", "road", "roads", "along_path")
+OF_CARS += ("steering", "steer", "car", "cars")
+"""Words that the ground floor does not know."""
 
 ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"}
 COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "geometry": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
-    "plants": {"numpy"},
-    "data": {"numpy", "pyarrow", "pint"},
     "models": {"flax"},
     "control": {"numpy"},
+    "data": {"numpy"},
     "training": {"optax", "orbax"},
     "certificate": {"cryptography"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
+    "driving.path_coordinates": {"numpy"},
+    "driving.plants": {"numpy"},
+    "driving.path_following": {"numpy"},
+    "driving.drives": {"numpy"},
+    "driving.logs": {"numpy", "pyarrow", "pint"},
+    "driving.simulation": {"numpy"},
+    "driving.corridor": {"numpy", "scipy"},
+    "paper": {"numpy"},
     "report": {"numpy", "pandas", "matplotlib", "PIL", "jinja2"},
     "policy": {"numpy"},
     "assembly": {"numpy"},
@@ -95,7 +130,15 @@ TEXTS = {
     for file in SRC.rglob("*.py")
 }
 FILES = {name: ast.parse(text) for name, text in TEXTS.items()}
-PACKAGE_OF = {name: name.split("/")[0].removesuffix(".py") for name in FILES}
+
+
+def package_of(parts: list[str]) -> str:
+    """The package of a file or of an imported name, such as "driving.plants"."""
+    inside = parts[0] == "driving" and len(parts) > 1 and parts[1] != "__init__"
+    return ".".join(parts[: 2 if inside else 1])
+
+
+PACKAGE_OF = {name: package_of(name.removesuffix(".py").split("/")) for name in FILES}
 LIBRARY = [
     name
     for name in FILES
@@ -104,6 +147,7 @@ LIBRARY = [
 ]
 """Files below the commands."""
 COMPILES = {"rollout", "policy", "training", "certification", "export", "data"}
+COMPILES |= {"driving.corridor", "driving.drives", "driving.logs"}
 """Packages that run on the host, and may call `jax.jit`; so may gymnasium's adapter."""
 
 
@@ -120,12 +164,12 @@ def imports(name: str) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def own(name: str) -> Iterator[list[str]]:
-    """The imports from this package as [package, the rest ...]."""
+def own(name: str) -> Iterator[tuple[str, list[str]]]:
+    """The imports from this package, as (package, parts of the name)."""
     for imported in imports(name):
         package, *rest = imported.split(".")
         if package == PACKAGE and rest != ["__version__"]:
-            yield rest or ["__init__"]
+            yield package_of(rest or ["__init__"]), rest
 
 
 def nodes(name: str, *kinds: type) -> list:
@@ -160,7 +204,7 @@ def fresh(code: str, **settings: str) -> str:
 
 def test_every_file_has_a_package_and_follows_the_arrows():
     assert set(PACKAGE_OF.values()) <= set(ARROWS), "state the arrows of a new package"
-    reached = {(name, rest[0]) for name in FILES for rest in own(name)}
+    reached = {(name, package) for name in FILES for package, _ in own(name)}
     assert [
         pair
         for pair in sorted(reached)
@@ -169,12 +213,30 @@ def test_every_file_has_a_package_and_follows_the_arrows():
     ] == []
 
 
+def test_no_floor_imports_one_above_it():
+    below = set()
+    for floor in FLOORS:
+        below |= set(floor)
+        assert {name: to - below for name, to in floor.items() if to - below} == {}
+
+
+def test_the_ground_floor_knows_no_car():
+    words = re.compile(rf"\b({'|'.join(OF_CARS)})\b", re.IGNORECASE)
+    assert {
+        f"{name}:{number}": line.strip()
+        for name, text in TEXTS.items()
+        if PACKAGE_OF[name] in GROUND
+        for number, line in enumerate(text.splitlines(), 1)
+        if words.search(line)
+    } == {}
+
+
 def test_packages_are_imported_through_their_public_names():
     assert [
         (name, rest)
         for name in FILES
-        for rest in own(name)
-        if rest[0] != PACKAGE_OF[name]
+        for package, rest in own(name)
+        if package != PACKAGE_OF[name]
         and any(part.startswith("_") for part in rest[1:])
     ] == []
 

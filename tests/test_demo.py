@@ -7,7 +7,8 @@ from composing import run
 from helpers import last_line, run_command
 
 from sfkd_jax import demo, policy
-from sfkd_jax.certificate import DrivingCertificate, read
+from sfkd_jax.certificate import read
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 BODY = ("+experiment=s3_body", "controller=mppi_tiny", "demo.episode_s=9.0")
 PATH = ("controller.mppi.num_samples=30", "optimized=false", "demo.episode_s=6.0")

@@ -12,6 +12,7 @@ import yaml
 
 from benchmarks import pages
 from sfkd_jax import certificate
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 ROOT = Path(__file__).parents[1]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "sfkd_jax"
@@ -154,7 +155,7 @@ def test_every_page_is_in_the_navigation_and_nothing_else_is():
 def test_every_table_of_numbers_is_made_from_a_committed_result():
     claims = certificate.read(
         pages.PRETRAINED / "kinematic_path/certificate.json",
-        certificate.DrivingCertificate,
+        DrivingCertificate,
     )
     enemy = claims.corridor.attack.shielded_lateral_m
     limit = f"got the kinematic car {enemy:.1f} m aside"

@@ -10,10 +10,11 @@ import pytest
 from composing import settings
 from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 
-from sfkd_jax import assembly, data, evaluation, models, plants, policy
+from sfkd_jax import assembly, models, policy
+from sfkd_jax.driving import drives, plants, simulation
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
+from sfkd_jax.driving.plants import StateVariable
 from sfkd_jax.info import ControllerInfo
-from sfkd_jax.path_coordinates import PATH_FRAME
-from sfkd_jax.plants import StateVariable
 from sfkd_jax.report.run import write_report
 from sfkd_jax.settings import schema
 from sfkd_jax.types import Controller
@@ -66,7 +67,7 @@ def test_it_is_simulated_through_the_sensor_that_it_states(registered):
         return follow(observation, reference), memory, info
 
     scenario = assembly.build_scenario({"name": "s1"}, plant, duration=3.0)
-    episode = evaluation.simulate(
+    episode = simulation.simulate(
         plant.step,
         Controller(lambda key: (), act),
         {},
@@ -87,7 +88,7 @@ def test_its_data_have_eight_states_and_its_loop_seven_coordinates():
     plant = electric()
     few = {"segments": 8, "steps": 5}
     in_world = jax.eval_shape(
-        partial(data.generate, plant, driver(plant), **few), jax.random.key(0)
+        partial(drives.generate, plant, driver(plant), **few), jax.random.key(0)
     )
     assert in_world.states.shape == (8, 6, 8)
     loop = assembly.build_loop(plant, LAW)
@@ -95,7 +96,7 @@ def test_its_data_have_eight_states_and_its_loop_seven_coordinates():
         "e_y", "e_psi", "v", "v_y", "yaw_rate", "steering", "charge",
     )  # fmt: skip
     along = jax.eval_shape(
-        partial(data.generate_along_path, loop, **few, **BOX), jax.random.key(0)
+        partial(drives.generate_along_path, loop, **few, **BOX), jax.random.key(0)
     )
     assert along.states.shape == (8, 6, 10)
     assert along.controls.shape == (8, 5, 4)

@@ -14,7 +14,7 @@ import pytest
 from helpers import driver
 
 import sfkd_jax
-from sfkd_jax import plants
+from sfkd_jax.driving import plants
 from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.types import Controller
 

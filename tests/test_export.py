@@ -24,17 +24,11 @@ from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, optimised, space, s
 import sfkd_jax
 from sfkd_jax import assembly, certification, policy, store
 from sfkd_jax import export as exporting
-from sfkd_jax.certificate import (
-    Boxes,
-    DrivingCertificate,
-    Provenance,
-    Refusal,
-    read,
-    write,
-)
+from sfkd_jax.certificate import Boxes, Provenance, Refusal, read, write
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.lanes import Lane, Obstacles
+from sfkd_jax.driving.paths import Path as Road
 from sfkd_jax.export import __main__ as export
-from sfkd_jax.lanes import Lane, Obstacles
-from sfkd_jax.paths import Path as Road
 from sfkd_jax.types import Controller
 
 HORIZON, STEPS = 5, 6

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax import plants
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.path_coordinates import circle_errors, is_valid
+from sfkd_jax.driving.paths import path_from_curvature, project
+from sfkd_jax.driving.plants._along_path import step_with_law
 from sfkd_jax.geometry import compose, without_pose
-from sfkd_jax.path_coordinates import circle_errors, is_valid
-from sfkd_jax.plants._along_path import step_with_law
-from sfkd_jax.scenarios import path_from_curvature, project
 from sfkd_jax.types import BODY
 
 CIRCLE_ERRORS = jit(circle_errors)

@@ -14,6 +14,7 @@ from helpers import optimised, same, straight
 
 import sfkd_jax
 from sfkd_jax import control, policy
+from sfkd_jax.driving import path_following
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.types import Controller
 
@@ -210,7 +211,7 @@ def test_a_shield_needs_a_corridor_and_a_control_of_the_vehicle():
     _, state, info = jax.eval_shape(own.act, trained.params, own.init(KEY), *inputs)
     assert jax.tree.structure(state) == jax.tree.structure(own.init(KEY))
     assert info.plan.states.shape == (20, 4)
-    lawful = control.in_the_world(scripted(jnp.zeros((1, 2))))
+    lawful = path_following.in_the_world(scripted(jnp.zeros((1, 2))))
     along = trained.shield(lawful, along_path=True)
     jax.eval_shape(along.act, trained.params, along.init(KEY), *inputs)
 

@@ -11,8 +11,10 @@ import pytest
 from helpers import put, refusal_of
 
 from sfkd_jax import policy, rollout, store
-from sfkd_jax.certificate import DrivingCertificate, read
-from sfkd_jax.certification import CertificationRefused, verify_driving
+from sfkd_jax.certificate import read
+from sfkd_jax.certification import CertificationRefused
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.corridor import verify_driving
 
 POLICIES = ("kinematic", "dynamic", "kinematic_path", "dynamic_path")
 

@@ -11,6 +11,7 @@ import benchmarks
 from benchmarks import pages, tables
 from experiments import results
 from sfkd_jax import certificate
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 PAGE = (results.HOME.parent / "docs" / "results.md").read_text("utf-8")
 PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
@@ -69,7 +70,7 @@ DRIVEN = ("dynamic", 0.104, 6.8), ("kinematic", 0.291, 13.3)
 @pytest.mark.parametrize(("plant", "corridor", "error"), DRIVEN)
 def test_the_corridor_and_what_was_driven_in_it(plant, corridor, error):
     path = PRETRAINED / f"{plant}_path" / "certificate.json"
-    claims = certificate.read(path, certificate.DrivingCertificate).corridor
+    claims = certificate.read(path, DrivingCertificate).corridor
     assert round(claims.corridor_m, 3) == corridor
     assert claims.coverage.share >= 0.93
     sfkd, oracle = (

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 import sfkd_jax
-from sfkd_jax.certificate import DrivingCertificate, read
+from sfkd_jax.certificate import read
+from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.policy import SHIPPED, policy_file
 
 ALONG_PATH = {"dynamic_path": 0.104, "kinematic_path": 0.291}

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfkd_jax import evaluation, store
+from sfkd_jax import store
+from sfkd_jax.driving import simulation
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.store import DirectoryLocked, locked
 
@@ -123,6 +124,6 @@ def test_two_processes_20_ms_after_each_other_lose_no_row_and_no_episode(tmp_pat
 @pytest.mark.parametrize("name", list(ROW))
 def test_rows_that_differ_in_one_part_of_their_identity_are_two(name):
     other = ROW | {name: "other"}
-    assert evaluation.merge([ROW], [other]) == [ROW, other]
-    assert evaluation.merge([ROW], [dict(ROW)]) == [ROW]
-    assert evaluation.identity(ROW) != evaluation.identity(other)
+    assert simulation.merge([ROW], [other]) == [ROW, other]
+    assert simulation.merge([ROW], [dict(ROW)]) == [ROW]
+    assert simulation.identity(ROW) != simulation.identity(other)

@@ -14,8 +14,9 @@ from composing import run, settings
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import assembly, collect, evaluate, plants
+from sfkd_jax import assembly, collect, evaluate
 from sfkd_jax.certificate import write
+from sfkd_jax.driving import plants
 from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.store import ArtefactError

@@ -19,7 +19,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float32MultiArray
 
 import sfkd_jax
-from sfkd_jax.scenarios import path_through, project, reference_window
+from sfkd_jax.driving.paths import path_through, project, reference_window
 
 PARAMETERS = {
     "policy": "runs/s3/sfkd_path/seed=0",

@@ -10,15 +10,15 @@ import numpy as np
 
 from sfkd_jax import certificate as certificates
 from sfkd_jax import policy, store
-from sfkd_jax.certificate import RecordedConditions
-from sfkd_jax.certification.corridor import (
+from sfkd_jax.driving.certificate import RecordedConditions
+from sfkd_jax.driving.corridor import (
     calibrate_on_runs,
     check_count,
     closed_loop,
     corridor_coverage,
     scores_of_runs,
 )
-from sfkd_jax.data import recorded_runs
+from sfkd_jax.driving.logs import recorded_runs
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.run import Run
 

@@ -56,8 +56,8 @@ _ADVICE = {
         "runs of the system, and collect them."
     ),
     Reason.ROLLING: (
-        "The car is slower than the certificate covers; the bound goes on from its "
-        "last value with the course of the car."
+        "The system is slower than the certificate covers; the bound goes on from its "
+        "last value."
     ),
     Reason.BAD_REFERENCE: "The reference is not finite, or nothing could follow it.",
     Reason.IMPRECISE: (
@@ -89,7 +89,7 @@ _ADVICE = {
     Reason.BRAKING: "The planner brakes harder than the certificate covers.",
     Reason.INFEASIBLE: "The law alone does not keep the nominal model in its corridor.",
     Reason.EVADING: (
-        "The car evades outside the certified references, or did so a short time ago."
+        "It evades outside the certified references, or did so a short time ago."
     ),
 }
 
@@ -153,7 +153,7 @@ class PlanInfo(NamedTuple):
         effective_samples: 1 / Σ w² of the sample weights; NaN if nothing is sampled.
         healthy: whether a working planner gave this plan, and not an earlier step.
         states: predicted along the chosen plan, (horizon, state); in the world where
-            the controller sees the world, and ξ inside of `control.along_reference`.
+            the controller sees the world, and ξ where it sees ξ.
         violation: the largest value of a constraint along the chosen plan; None for a
             task without constraints.
     """
@@ -167,7 +167,7 @@ class PlanInfo(NamedTuple):
 
 
 class PathInfo(NamedTuple):
-    """The projection onto the path, from `control.along_reference`.
+    """The projection onto the path, from `path_following.along_reference`.
 
     Attributes:
         xi: measured ξ, (coordinate,); NaN where it is not measured.
@@ -182,7 +182,7 @@ class PathInfo(NamedTuple):
 
 
 class GateInfo(NamedTuple):
-    """What `control.Gate` made of the measurement.
+    """What `path_following.Gate` made of the measurement.
 
     Attributes:
         measured: which entries of ξ are measured and not predicted, (coordinate,).
@@ -198,11 +198,11 @@ class GateInfo(NamedTuple):
 
 
 class AdaptationInfo(NamedTuple):
-    """What `control.Adaptation` has estimated.
+    """What `path_following.Adaptation` has estimated.
 
     Attributes:
         env: the e that the planner reads, (environment,).
-        causes: the unmeasured causes in the order of `control.Adaptation`, (cause,).
+        causes: the unmeasured causes in the order of the adaptation, (cause,).
         causes_std: their standard deviations, (cause,).
         rejected: whether nothing was learned from the measurement.
         adapting: whether the causes predict no worse than none; otherwise they are not
@@ -217,7 +217,7 @@ class AdaptationInfo(NamedTuple):
 
 
 class ShieldInfo(NamedTuple):
-    """What `control.Shield` let pass.
+    """What `path_following.Shield` let pass.
 
     Attributes:
         margin: distance of the nominal model to the edge of its corridor [m]; NaN
@@ -241,13 +241,13 @@ class ShieldInfo(NamedTuple):
 
 
 class LaneInfo(NamedTuple):
-    """The reference that `control.InLane` chose.
+    """The reference that `path_following.InLane` chose.
 
     Attributes:
         reference: the window that is followed, (horizon, 4).
         offset: of the reference from the centre line [m].
-        clearance: distance that the car keeps from all obstacles along the whole
-            committed reference [m]; NaN where no bound holds.
+        clearance: distance from all obstacles along the whole committed reference [m];
+            NaN where no bound holds.
         admissible: whether the committed reference is free, and inside class and lane.
         stopping: whether it ends at rest.
         evading: whether it is outside the class.

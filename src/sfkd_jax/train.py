@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.certificate import DrivingCertificate
+from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run

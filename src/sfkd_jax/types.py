@@ -192,24 +192,6 @@ class Explicit(NamedTuple):
     declared: Declared
 
 
-class LinearPredictor(NamedTuple):
-    """A predictor of the state along a path that is linear in a lift, for one e.
-
-        z⁺ = A z + B u + d κ + c,   x = C z + o,   z = lift(x)
-
-    x is a `State` whose pose is (progress [m], distance left of the path [m], yaw
-    relative to it [rad]); κ is the path's curvature [1/m].
-    """
-
-    lift: Callable[[State], Float[Array, " rank"]]
-    A: Float[Array, "rank rank"]
-    B: Float[Array, "rank control"]
-    d: Float[Array, " rank"]
-    c: Float[Array, " rank"]
-    C: Float[Array, "state rank"]
-    o: State
-
-
 class Fitting(NamedTuple):
     """How the parameters of a model are fitted, besides gradient descent from `init`.
 
@@ -231,12 +213,12 @@ class Structure(NamedTuple):
     Attributes:
         explicit: params -> `Explicit`, or None.
         rate: params -> α, the contraction rate of `step`, or None if there is none.
-        linear: fiber -> `LinearPredictor`, or None.
+        linear: fiber -> a predictor that is linear in a lift of the state, or None.
     """
 
     explicit: Callable[[Params], Explicit] | None = None
     rate: Callable[[Params], Scalar] | None = None
-    linear: Callable[[Fiber], LinearPredictor] | None = None
+    linear: Callable[[Fiber], Any] | None = None
 
 
 class Model(NamedTuple):
@@ -289,7 +271,7 @@ class Controller(NamedTuple):
         init: key -> controller state.
         act: (params, controller_state, observation, env, reference) -> (control,
             controller_state, info); what stands for observation and reference is up to
-            the task, see `control.free_task` and `control.along_reference`.
+            the task, see `control.free_task` and `path_following.along_reference`.
     """
 
     init: Callable[[Key], Any]

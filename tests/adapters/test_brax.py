@@ -13,7 +13,8 @@ from brax import envs
 from brax.envs.wrappers.training import EvalWrapper, wrap
 from helpers import at, jit, same
 
-from sfkd_jax import adapters, assembly, control, evaluation, geometry, plants
+from sfkd_jax import adapters, assembly, geometry
+from sfkd_jax.driving import path_following, plants, simulation
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.types import Controller
 
@@ -71,7 +72,7 @@ def test_a_controller_drives_it_as_the_test_track_has_it_driven():
 
     start = compiled()[0](jax.random.key(0))
     controller, given = Controller(lambda key: (), act), {"dt": plant.dt, "horizon": 10}
-    run = jit(partial(evaluation.simulate, plant.step, controller, {}, **given))
+    run = jit(partial(simulation.simulate, plant.step, controller, {}, **given))
     episode = run(start.info["road"], jax.random.key(0))
     _, after = driven(jax.vmap(env().action)(episode.controls))
     moments = after.pipeline_state
@@ -111,7 +112,7 @@ def test_the_reward_is_minus_the_cost_of_lateral_speed_and_steering_rate_as_the_
     )[:, 0]
     parts = (moments.lateral, moments.state[:, 3] - 10.0, np.diff(steering) / env().dt)
     names = ("lateral", "speed", "steering_rate")
-    planner = inspect.signature(control.tracking_cost).parameters
+    planner = inspect.signature(path_following.tracking_cost).parameters
     weights = [planner[name].default for name in names]
     cost = sum(weight * part**2 for weight, part in zip(weights, parts, strict=True))
     np.testing.assert_allclose(after.reward, -cost, rtol=1e-4)

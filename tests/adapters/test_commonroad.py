@@ -21,7 +21,8 @@ from vehiclemodels import (
     vehicle_parameters,
 )
 
-from sfkd_jax import adapters, evaluation, scenarios
+from sfkd_jax import adapters
+from sfkd_jax.driving import scenarios, simulation
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.types import Controller
 
@@ -159,13 +160,13 @@ def test_a_controller_for_our_plant_keeps_such_a_car_in_its_lane(model):
     envs = road.envs.at[:, 0].set(0.6)
     road = road._replace(envs=envs, observed_envs=envs)
     run = jit(
-        lambda key: evaluation.simulate(
+        lambda key: simulation.simulate(
             car.step, controller, {}, road, key, dt=car.dt, horizon=2
         )
     )
     episode = run(jax.random.key(0))
     batch = jax.tree.map(lambda leaf: leaf[None], episode)
-    scores = evaluation.score(batch, dt=car.dt, size=car.size)
+    scores = simulation.score(batch, dt=car.dt, size=car.size)
     assert not scores["departures"].any()
     assert float(episode.progress[-1]) > 45.0
     assert np.abs(episode.states[:, 2]).max() > 0.05

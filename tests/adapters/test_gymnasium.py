@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from sfkd_jax import adapters
-from sfkd_jax.lanes import Lane, Obstacles
+from sfkd_jax.driving.lanes import Lane, Obstacles
 
 adapters.register_gymnasium()
 SETTINGS = {"scenario": "s3", "duration": 3.0}

@@ -7,28 +7,22 @@ import numpy as np
 import pytest
 from helpers import TINY, any_law, path_space
 
-from sfkd_jax import data as datasets
 from sfkd_jax import models, policy, store
-from sfkd_jax.certificate import (
-    Bounds,
-    Boxes,
-    Coverage,
-    DrivingCertificate,
-    Provenance,
-    read,
-    write,
-)
-from sfkd_jax.certification import measure, prove, verify_driving
-from sfkd_jax.certification._corridor_bounds import (
+from sfkd_jax.certificate import Boxes, Coverage, Provenance, read, write
+from sfkd_jax.certification import measure, prove
+from sfkd_jax.certification._measured import coverage_interval
+from sfkd_jax.driving import drives
+from sfkd_jax.driving.certificate import Bounds, DrivingCertificate
+from sfkd_jax.driving.corridor import verify_driving
+from sfkd_jax.driving.corridor._bounds import (
     ALONE,
     JOINT,
     calibrate_corridor,
     corridor_coverage,
 )
-from sfkd_jax.certification._measured import coverage_interval
-from sfkd_jax.certification.corridor import closed_loop, measure_corridor
-from sfkd_jax.path_coordinates import PATH_FRAME
-from sfkd_jax.plants import kinematic
+from sfkd_jax.driving.corridor._measuring import closed_loop, measure_corridor
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
+from sfkd_jax.driving.plants import kinematic
 
 NAMES = (*JOINT, *ALONE)
 
@@ -83,7 +77,7 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     model = models.sfkd(path_space(), **options)
     params = model.init(jax.random.key(0))
     loop = closed_loop(kinematic(), model, params, any_law(), (0.015, 0.015, 0.002))
-    generate = datasets.generate_along_path
+    generate = drives.generate_along_path
     driven = jax.jit(
         lambda key: generate(loop.plant, key, segments=120, steps=20, **BOX)
     )(jax.random.key(1))

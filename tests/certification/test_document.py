@@ -12,14 +12,11 @@ from documents import document, hashed, policy_copy, refusal, shipped
 from helpers import put, refusal_of
 
 from sfkd_jax import certificate, policy, store
-from sfkd_jax.certificate import Certificate, DrivingCertificate, parse, read, write
-from sfkd_jax.certification import (
-    CertificateStale,
-    _verification,
-    verify,
-    verify_driving,
-)
+from sfkd_jax.certificate import Certificate, parse, read, write
+from sfkd_jax.certification import CertificateStale, _verification, verify
 from sfkd_jax.certification._weights import exported
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.corridor import verify_driving
 
 POLICIES = ("kinematic", "dynamic", "kinematic_path", "dynamic_path")
 FORGED = ("kinematic", "dynamic_path")

@@ -26,7 +26,7 @@ from sfkd_jax.certification._metric_claims import (
 from sfkd_jax.certification._metrics import accepted_metric, propose_metric
 from sfkd_jax.certification._tubes import radii
 from sfkd_jax.certification._weights import exported
-from sfkd_jax.path_coordinates import PATH_FRAME
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Declared, Trajectory
 

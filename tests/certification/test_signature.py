@@ -10,7 +10,8 @@ from helpers import put, refusal_of
 
 import sfkd_jax
 from sfkd_jax import certificate, policy, store
-from sfkd_jax.certificate import DrivingCertificate, read, write
+from sfkd_jax.certificate import read, write
+from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.experiment import stages
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law, certified, jit, model_and_params
 
-from sfkd_jax import assembly, certification, control, models, plants
+from sfkd_jax import assembly, certification, models
 from sfkd_jax.certification._weights import exported
-from sfkd_jax.control.wrappers import _estimator as estimator
-from sfkd_jax.control.wrappers._adaptation import _compensation
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
+from sfkd_jax.driving.path_following.wrappers import _estimator as estimator
+from sfkd_jax.driving.path_following.wrappers._adaptation import _compensation
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo
-from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
@@ -49,10 +50,10 @@ def law_alone():
 @cache
 def adaptive(**settings):
     options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW} | settings
-    adaptation = control.Adaptation(**options).controller()
+    adaptation = path_following.Adaptation(**options).controller()
     about = {"model": MODEL, "law": LAW, "dt": PLANT.dt, "horizon": HORIZON}
-    gate = control.Gate(inner=adaptation, **about).controller()
-    return control.along_reference(gate, coordinates=3)
+    gate = path_following.Gate(inner=adaptation, **about).controller()
+    return path_following.along_reference(gate, coordinates=3)
 
 
 def road(time, speed=10.0):
@@ -236,7 +237,7 @@ def test_causes_that_predict_worse_than_none_are_not_used():
 def test_a_force_that_could_be_noise_is_shrunk():
     """f max(0, 1 - s var f / f²), and no other cause."""
     options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW}
-    adaptation = control.Adaptation(**options)
+    adaptation = path_following.Adaptation(**options)
     belief = adaptation.init(jax.random.key(0)).belief
     mean = jnp.asarray([0.0, 0.0, 10.0, 0.4, 0.01, 0.02, 0.03, 0.5])
     for variance, left in ((0.2, 0.4 - 0.3 * 0.2 / 0.4), (0.6, 0.0)):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from helpers import any_law, tiny
 
-from sfkd_jax import assembly, control, plants
-from sfkd_jax.path_coordinates import curvature_ahead, path_coordinates
-from sfkd_jax.scenarios import path_from_curvature, reference_window
+from sfkd_jax import assembly, control
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.path_coordinates import curvature_ahead, path_coordinates
+from sfkd_jax.driving.paths import path_from_curvature, reference_window
 
 PLANT = plants.kinematic()
 LAW = any_law()
@@ -34,9 +35,11 @@ def bend(slope=1e-4):
 def planner(samples, **options):
     """A planner around the law, as a controller in the world, and its step."""
     model = assembly.reference_systems(PLANT, LAW)["oracle"].model
-    task = control.following_law(model, control.tracking_cost(dt=0.1), LAW, **LIMITS)
+    task = path_following.following_law(
+        model, path_following.tracking_cost(dt=0.1), LAW, **LIMITS
+    )
     along = control.mppi(task, num_samples=samples, noise_std=(0.01, 0.2), **options)
-    controller = control.along_reference(along, coordinates=3)
+    controller = path_following.along_reference(along, coordinates=3)
     return controller.init(jax.random.key(0)), jax.jit(controller.act)
 
 
@@ -90,7 +93,10 @@ def test_predicted_states_lie_where_the_car_then_is():
 
 def test_a_model_of_the_world_is_refused():
     make = partial(
-        control.following_law, law=LAW, cost=control.tracking_cost(dt=0.1), **LIMITS
+        path_following.following_law,
+        law=LAW,
+        cost=path_following.tracking_cost(dt=0.1),
+        **LIMITS,
     )
     with pytest.raises(ValueError, match=r"model\.frame=path"):
         make(tiny())

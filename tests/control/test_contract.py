@@ -23,7 +23,9 @@ from helpers import (
 )
 from jaxtyping import jaxtyped
 
-from sfkd_jax import assembly, control, models, plants
+from sfkd_jax import assembly, control, models
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.info import (
     AdaptationInfo,
     Claim,
@@ -37,7 +39,6 @@ from sfkd_jax.info import (
     first,
     reported,
 )
-from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import fold, with_offset
 
 PLANT = plants.kinematic()
@@ -62,8 +63,8 @@ SMALL = {
 def along_path(law, **settings):
     """The task of tracking a path with the kinematic bicycle, and its parameters."""
     model, params = model_and_params("nominal")
-    cost = control.tracking_cost(dt=PLANT.dt)
-    return control.path_tracking(
+    cost = path_following.tracking_cost(dt=PLANT.dt)
+    return path_following.path_tracking(
         model, cost, law, dt=PLANT.dt, **LIMITS, **settings
     ), params
 
@@ -96,8 +97,8 @@ def registered(name):
 
 def around_law(model, law):
     """A tiny planner along a path."""
-    task = control.following_law(
-        model, control.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS
+    task = path_following.following_law(
+        model, path_following.tracking_cost(dt=PLANT.dt), law, dt=PLANT.dt, **LIMITS
     )
     return control.mppi(
         task, num_samples=16, horizon=HORIZON, noise_std=(0.01, 0.3), **BOX
@@ -112,13 +113,13 @@ def path_model():
 
 def along(controller):
     """A controller along a path as one in the world."""
-    return control.along_reference(controller, coordinates=3)
+    return path_following.along_reference(controller, coordinates=3)
 
 
 def shielded():
     """With a filter, in path coordinates."""
     law, (model, params) = any_law(), path_model()
-    shield = control.Shield(
+    shield = path_following.Shield(
         inner=around_law(model, law),
         model=model,
         law=law,
@@ -126,7 +127,7 @@ def shielded():
         tube=0.2,
         horizon=8,
         control=(LIMITS["control_low"], LIMITS["control_high"]),
-        conditions=control.Conditions(env=(BOX["env_low"], BOX["env_high"])),
+        conditions=path_following.Conditions(env=(BOX["env_low"], BOX["env_high"])),
     )
     return gated(shield.controller(), model, law, shield.conditions), params
 
@@ -134,7 +135,7 @@ def shielded():
 def gated(inner, model, law, conditions):
     """A controller along a path behind the gate, in the world."""
     about = {"model": model, "law": law, "dt": PLANT.dt, "horizon": HORIZON}
-    gate = control.Gate(inner=inner, conditions=conditions, **about)
+    gate = path_following.Gate(inner=inner, conditions=conditions, **about)
     return along(gate.controller())
 
 
@@ -142,7 +143,7 @@ def adaptive():
     """With estimates of unmeasured causes, in path coordinates."""
     law, (model, params) = any_law(), path_model()
     planner = around_law(with_offset(model), law)
-    adaptation = control.Adaptation(
+    adaptation = path_following.Adaptation(
         inner=planner,
         model=model,
         law=law,
@@ -151,7 +152,7 @@ def adaptive():
         **LIMITS,
         **BOX,
     )
-    conditions = control.Conditions(env=(BOX["env_low"], BOX["env_high"]))
+    conditions = path_following.Conditions(env=(BOX["env_low"], BOX["env_high"]))
     return gated(adaptation.controller(), model, law, conditions), params
 
 
@@ -168,10 +169,10 @@ def constrained():
     return planned, params
 
 
-FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
+FEEDBACK = path_following.path_feedback(wheelbase=PLANT.wheelbase)
 PLANNERS = {name: partial(registered, name) for name in assembly.PLANNERS}
 VARIANTS = {
-    "mppi_plain": partial(mppi, control.no_feedback(), noise_std=(0.06, 0.6)),
+    "mppi_plain": partial(mppi, path_following.no_feedback(), noise_std=(0.06, 0.6)),
     "mppi_knots": partial(
         mppi,
         FEEDBACK,

@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 from helpers import dataset, jit, model_and_params
 
-from sfkd_jax import control, evaluation, models, plants, scenarios
 from sfkd_jax import data as datasets
-from sfkd_jax.control import StageInputs
-from sfkd_jax.control.planners._koopman_mpc import box_qp
+from sfkd_jax import paper
+from sfkd_jax.driving import (
+    path_coordinates,
+    path_following,
+    paths,
+    plants,
+    scenarios,
+    simulation,
+)
+from sfkd_jax.driving.path_following import StageInputs
+from sfkd_jax.paper._koopman_mpc import box_qp
 
 PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
@@ -24,7 +32,7 @@ OFFSET = jnp.asarray([0.0, 0.3, 0.05, 9.5])
 @cache
 def koopman():
     """A predictor of the kinematic car from a few segments of driving."""
-    model = models.koopman(
+    model = paper.koopman(
         datasets.measure_space(dataset()), functions=20, environment_degree=1
     )
     return model, jit(model.fitting.identify)(
@@ -34,8 +42,8 @@ def koopman():
 
 @cache
 def compiled():
-    cost = control.tracking_cost(dt=PLANT.dt)
-    controller = control.koopman_mpc(koopman()[0], cost, horizon=HORIZON, **LIMITS)
+    cost = path_following.tracking_cost(dt=PLANT.dt)
+    controller = paper.koopman_mpc(koopman()[0], cost, horizon=HORIZON, **LIMITS)
     return controller, jit(controller.act)
 
 
@@ -64,16 +72,16 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted():
     moved = jnp.asarray([1.0, 0.25, 0.04, 9.6])
     action, after, info = act(moved, state)
     linear = model.structure.linear(model.fiber(params, ENV))
-    tracking = control.tracking_cost(dt=0.1)
-    curvature = control.reference_curvature(BEND)
-    errors = control.path_errors(moved, BEND[0], curvature[0])
+    tracking = path_following.tracking_cost(dt=0.1)
+    curvature = path_coordinates.reference_curvature(BEND)
+    errors = path_following.path_errors(moved, BEND[0], curvature[0])
     z = linear.lift(moved.at[:3].set(jnp.stack([0.0, errors.lateral, errors.heading])))
     total, before = 0.0, first
     # The plan of which `action` was the first step.
     for k, now in enumerate(np.concatenate([action[None], after.plan[:-1]])):
         z = linear.A @ z + linear.B @ now + linear.d * curvature[k] + linear.c
         x = linear.C @ z + linear.o
-        later = control.PathErrors(x[1], x[2], x[3] - BEND[k, 3])
+        later = path_following.PathErrors(x[1], x[2], x[3] - BEND[k, 3])
         cost = tracking.stage(
             tracking.weights, StageInputs(later, errors, now, before, BEND[k, 3])
         )
@@ -85,12 +93,12 @@ def test_the_cost_is_the_tracking_cost_of_what_is_predicted():
 @cache
 def drive(curvature, offset):
     """An episode beside a path of constant curvature, without sensor noise."""
-    path = scenarios.path_from_curvature(jnp.full(300, curvature), spacing=0.5)
+    path = paths.path_from_curvature(jnp.full(300, curvature), spacing=0.5)
     start = jnp.asarray([0.0, offset, 0.0, 10.0])
     envs = jnp.tile(ENV, (50, 1))
     road = scenarios.Scenario(start, envs, envs, path, jnp.asarray(10.0))
     run = partial(
-        evaluation.simulate,
+        simulation.simulate,
         PLANT.step,
         compiled()[0],
         dt=0.1,
@@ -116,9 +124,9 @@ def test_predictions_are_told_in_the_world():
 
 
 def test_a_model_that_is_not_linear_in_a_lift_is_refused():
-    cost = control.tracking_cost(dt=0.1)
+    cost = path_following.tracking_cost(dt=0.1)
     with pytest.raises(ValueError, match="linear"):
-        control.koopman_mpc(model_and_params("oracle")[0], cost, **LIMITS)
+        paper.koopman_mpc(model_and_params("oracle")[0], cost, **LIMITS)
 
 
 # ---- the quadratic program

@@ -11,15 +11,21 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import control
-from sfkd_jax.control.lanes._judging import Situation
-from sfkd_jax.control.lanes._reference import SPLICE, Committed, curve, road_ahead
+from sfkd_jax.driving import path_following
+from sfkd_jax.driving.lanes import Obstacles, circles, clearance, lane_along
+from sfkd_jax.driving.path_following.lanes._judging import Situation
+from sfkd_jax.driving.path_following.lanes._reference import (
+    SPLICE,
+    Committed,
+    curve,
+    road_ahead,
+)
+from sfkd_jax.driving.paths import Lap, path_from_curvature, path_through, quintic
 from sfkd_jax.info import Claim, ControllerInfo, Reason
-from sfkd_jax.lanes import Obstacles, circles, clearance, lane_along
-from sfkd_jax.paths import Lap, path_from_curvature, path_through, quintic
 from sfkd_jax.types import Controller
 
 MOVE = jit(quintic)
-KIND = control.Class(
+KIND = path_following.Class(
     curvature=0.02,
     turning=0.0025,
     lateral=2.0,
@@ -139,10 +145,10 @@ def follower():
 
 def lane_with(planner, **settings):
     """The controller of a lane, and its step as one program."""
-    task = control.Manoeuvres(kind=KIND, dt=DT)
+    task = path_following.Manoeuvres(kind=KIND, dt=DT)
     search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
     search = planner(task.task(), **search, **settings)
-    driver = control.in_lane(
+    driver = path_following.in_lane(
         inner=follower(), planner=search, manoeuvres=task, horizon=20
     )
     return driver, jit(driver.act)
@@ -270,7 +276,7 @@ def test_ways_round_lead_from_one_side_of_an_obstacle_to_the_other_of_the_next()
     lane = lane_along(path_from_curvature(jnp.zeros(400), spacing=0.5), width=8.0)
     ahead, count = road_ahead(lane, jnp.asarray(0), 200, (1.0, 1.0)), 200
     straight = Committed(jnp.asarray(0), jnp.zeros((3, count)), jnp.full(count, 100.0))
-    task = control.Manoeuvres(kind=KIND, dt=DT)
+    task = path_following.Manoeuvres(kind=KIND, dt=DT)
     posts = circles(jnp.asarray([[40.0, 1.2], [85.0, -1.2], [-20.0, 0.0]]), 0.8)
     place, grip = jnp.asarray(2.0), jnp.asarray(0.9 * 9.81)
     scene = Situation(ahead, straight, posts, place, grip, jnp.asarray(True))

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from helpers import ENV_HIGH, ENV_LOW, jit, model_and_params, straight
 
-from sfkd_jax import control, models, plants
+from sfkd_jax import control, models
+from sfkd_jax.driving import path_following, plants
 
 PLANT = plants.kinematic()
 LIMITS = {"control_low": PLANT.control_low, "control_high": PLANT.control_high}
 BOX = {"env_low": ENV_LOW, "env_high": ENV_HIGH}
-COST = control.tracking_cost(dt=0.1)
-FEEDBACK = control.path_feedback(wheelbase=PLANT.wheelbase)
+COST = path_following.tracking_cost(dt=0.1)
+FEEDBACK = path_following.path_feedback(wheelbase=PLANT.wheelbase)
 HORIZON = 8
 OFFSET = np.float32([0.0, 0.3, 0.0, 10.0])
 ENV = np.float32([0.7, 3.0])
@@ -21,7 +22,7 @@ REFERENCE = np.asarray(straight(HORIZON))
 
 
 def planner(model, law=FEEDBACK, **settings):
-    task = control.path_tracking(model, COST, law, dt=0.1, **LIMITS)
+    task = path_following.path_tracking(model, COST, law, dt=0.1, **LIMITS)
     return control.mppi(
         task, **{"num_samples": 64, "horizon": HORIZON, **BOX, **settings}
     )
@@ -45,7 +46,7 @@ def test_a_reading_far_off_leaves_no_more_in_the_plan_than_the_actuators_can_do(
     would persist.
     """
     controller, params, act = compiled(
-        law=control.LinearFeedback(wheelbase=PLANT.wheelbase)
+        law=path_following.LinearFeedback(wheelbase=PLANT.wheelbase)
     )
     span = np.subtract(PLANT.control_high, PLANT.control_low)
     for entry, value in ((0, 4e4), (1, -4e4), (3, 1e6)):

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from helpers import jit, straight
 
-from sfkd_jax import control, models, plants, scenarios
-from sfkd_jax.control import PathErrors, StageInputs
-from sfkd_jax.path_coordinates import followable
-from sfkd_jax.scenarios import reference_window
+from sfkd_jax import control, models
+from sfkd_jax.driving import path_coordinates, path_following, paths, plants
+from sfkd_jax.driving.path_coordinates import followable
+from sfkd_jax.driving.path_following import PathErrors, StageInputs
+from sfkd_jax.driving.paths import reference_window
 
-ERRORS = jit(jax.vmap(control.path_errors))
+ERRORS = jit(jax.vmap(path_following.path_errors))
 RADIUS = 40.0
 
 
@@ -68,7 +69,7 @@ def test_path_errors_do_not_depend_on_where_the_world_puts_its_origin():
 
 def test_the_curvature_of_a_reference_is_that_of_its_circle():
     window = on_circle(np.arange(1.0, 9.0)).astype(np.float32)
-    curvature = jit(control.reference_curvature)(window)
+    curvature = jit(path_coordinates.reference_curvature)(window)
     chord = 2 * RADIUS * np.sin(0.5 / RADIUS)
     np.testing.assert_allclose(curvature, np.full(8, 1 / RADIUS / chord), rtol=1e-4)
     assert curvature.shape == (8,)
@@ -76,7 +77,9 @@ def test_the_curvature_of_a_reference_is_that_of_its_circle():
 
 @pytest.mark.parametrize("window", [straight(6), np.zeros((6, 4), np.float32)])
 def test_a_straight_or_standing_reference_has_no_curvature(window):
-    np.testing.assert_array_equal(jit(control.reference_curvature)(window), np.zeros(6))
+    np.testing.assert_array_equal(
+        jit(path_coordinates.reference_curvature)(window), np.zeros(6)
+    )
 
 
 def scalar(value):
@@ -84,14 +87,16 @@ def scalar(value):
 
 
 def test_the_law_steers_and_brakes_against_its_errors():
-    law = control.path_feedback(
+    law = path_following.path_feedback(
         wheelbase=2.7, lateral_gain=0.03, heading_gain=0.4, speed_gain=2.0
     )
     off = PathErrors(scalar(0.4), scalar(0.1), scalar(0.5))
     np.testing.assert_allclose(
         law(off, scalar(0.0), scalar(9.0)), [-0.012 - 0.04, -1.0], rtol=1e-5
     )
-    commanded = control.path_feedback(wheelbase=2.7, speed_gain=2.0, speed_loop=True)
+    commanded = path_following.path_feedback(
+        wheelbase=2.7, speed_gain=2.0, speed_loop=True
+    )
     np.testing.assert_allclose(
         commanded(off, scalar(0.0), scalar(9.0))[1], 8.0, rtol=1e-6
     )
@@ -99,12 +104,14 @@ def test_the_law_steers_and_brakes_against_its_errors():
 
 def test_near_the_path_and_above_5_m_s_the_law_is_linear_bit_for_bit():
     random = np.random.default_rng(0)
-    errors = PathErrors(*(scalar(random.uniform(-e, e, 500)) for e in control.NEAR))
+    errors = PathErrors(
+        *(scalar(random.uniform(-e, e, 500)) for e in path_following.NEAR)
+    )
     road = scalar(random.uniform(-0.02, 0.02, 500)), scalar(random.uniform(6, 13, 500))
     for loop in (False, True):
         laws = (
             jax.vmap(law(wheelbase=2.7, speed_loop=loop))(errors, *road)
-            for law in (control.LinearFeedback, control.path_feedback)
+            for law in (path_following.LinearFeedback, path_following.path_feedback)
         )
         np.testing.assert_array_equal(*laws)
 
@@ -113,7 +120,7 @@ def test_near_the_path_and_above_5_m_s_the_law_is_linear_bit_for_bit():
 def test_the_law_comes_back_from_anywhere(name):
     """Within 0.3 m and 0.3 rad for good after 21 s; linear, a fifth of these do not."""
     plant = getattr(plants, name)()
-    law = control.path_feedback(wheelbase=plant.wheelbase)
+    law = path_following.path_feedback(wheelbase=plant.wheelbase)
     limits = jnp.asarray(plant.control_low), jnp.asarray(plant.control_high)
 
     @jit
@@ -121,7 +128,7 @@ def test_the_law_comes_back_from_anywhere(name):
     def drive(start, friction):
         def step(state, _):
             point = jnp.stack([state[0], 0.0, 0.0, 10.0])
-            errors = control.path_errors(state, point, jnp.zeros(()))
+            errors = path_following.path_errors(state, point, jnp.zeros(()))
             u = jnp.clip(law(errors, jnp.zeros(()), point[3]), *limits)
             state = plant.step(state, u, jnp.stack([friction, 0.0]))
             return state, state[1:3]
@@ -141,12 +148,14 @@ def planned(wheelbase, starts, speeds):
     """States, controls and health of 25 s on 60 m of straight road, from these starts
     at these reference speeds, planned with 64 samples.
     """
-    road = scenarios.path_through(jnp.asarray([[0.0, 0.0], [30.0, 0.0], [60.0, 0.0]]))
+    road = paths.path_through(jnp.asarray([[0.0, 0.0], [30.0, 0.0], [60.0, 0.0]]))
     limits = {"control_low": (-0.5, -6.0), "control_high": (0.5, 3.0)}
     step = plants.own(wheelbase=wheelbase, **limits).nominal
-    law = control.path_feedback(wheelbase=wheelbase)
-    cost = control.tracking_cost(dt=0.1)
-    task = control.path_tracking(models.physics(step), cost, law, dt=0.1, **limits)
+    law = path_following.path_feedback(wheelbase=wheelbase)
+    cost = path_following.tracking_cost(dt=0.1)
+    task = path_following.path_tracking(
+        models.physics(step), cost, law, dt=0.1, **limits
+    )
     planner = control.mppi(task, num_samples=64, horizon=10, effective_samples=20.0)
 
     @jit
@@ -157,7 +166,7 @@ def planned(wheelbase, starts, speeds):
             window = reference_window(road, along, speed, dt=0.1, horizon=10)
             u, memory, info = planner.act({}, memory, state, jnp.zeros(2), window)
             state = step(state, u, jnp.zeros(2))
-            along, _ = scenarios.project(road, state[:2], along)
+            along, _ = paths.project(road, state[:2], along)
             return (state, along, memory), (state, u, info.healthy)
 
         begin = (start, start[0], planner.init(jax.random.key(0)))
@@ -203,7 +212,7 @@ def test_a_reference_that_cannot_be_followed_is_one_to_stop(change):
 
 def test_a_car_that_stops_in_a_bend_keeps_its_curvature():
     window = on_circle(np.minimum(np.arange(1.0, 9.0), 4.0)).astype(np.float32)
-    curvature = jit(control.reference_curvature)(window)
+    curvature = jit(path_coordinates.reference_curvature)(window)
     np.testing.assert_allclose(curvature, np.full(8, 1 / RADIUS), rtol=1e-3)
 
 
@@ -224,7 +233,7 @@ def stage(
 
 def charge(seen, **settings):
     """The cost with the weights it was made with."""
-    cost = control.tracking_cost(dt=0.1, **settings)
+    cost = path_following.tracking_cost(dt=0.1, **settings)
     return cost.stage(cost.weights, seen)
 
 

@@ -10,11 +10,12 @@ import pytest
 from composing import settings
 from helpers import jit
 
-from sfkd_jax import assembly, plants, policy
-from sfkd_jax.control import TEXTBOOK, derive_path_law, textbook_law
+from sfkd_jax import assembly, policy
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.path_coordinates import path_step
+from sfkd_jax.driving.path_following import TEXTBOOK, derive_path_law, textbook_law
 from sfkd_jax.experiment import identified, laws
 from sfkd_jax.geometry import without_pose
-from sfkd_jax.path_coordinates import path_step
 from sfkd_jax.types import BODY
 
 BOX = {"env_low": (0.3, -8.0), "env_high": (0.9, 8.0)}

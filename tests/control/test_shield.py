@@ -11,20 +11,20 @@ import pytest
 from helpers import any_law, jit, tiny
 
 import sfkd_jax
-from sfkd_jax import assembly, control, scenarios
-from sfkd_jax.certificate import (
-    Boxes,
+from sfkd_jax import assembly
+from sfkd_jax.certificate import Boxes, read
+from sfkd_jax.driving import path_following, paths, scenarios
+from sfkd_jax.driving.certificate import (
     DrivingCertificate,
     JointBounds,
     Recorded,
     RecordedConditions,
-    read,
 )
-from sfkd_jax.control import Conditions, along_reference, safety_filter
+from sfkd_jax.driving.path_coordinates import PATH_FRAME, vehicle_state
+from sfkd_jax.driving.path_following import Conditions, along_reference, safety_filter
+from sfkd_jax.driving.plants import kinematic
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
-from sfkd_jax.path_coordinates import PATH_FRAME, vehicle_state
-from sfkd_jax.plants import kinematic
 from sfkd_jax.policy import SHIPPED
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
@@ -103,14 +103,14 @@ def scripted():
 def filtered(**changes):
     options = {"inner": scripted(), "model": TOY, "law": LAW, "width": WIDTH}
     options |= {"tube": TUBE, "control": (LOW, HIGH)}
-    shield = control.Shield(**options | changes)
+    shield = path_following.Shield(**options | changes)
     return gated(shield.controller(), conditions=shield.conditions)
 
 
 def gated(inner, **changes):
     """A controller along a path behind the gate, in the world."""
     options = {"model": TOY, "law": LAW, "dt": 0.1, "horizon": HORIZON}
-    gate = control.Gate(inner=inner, **options | changes)
+    gate = path_following.Gate(inner=inner, **options | changes)
     return along_reference(gate.controller(), coordinates=3)
 
 
@@ -252,7 +252,7 @@ def test_the_largest_scale_that_keeps_the_nominal_model_inside_is_chosen():
     for _ in range(100):
         edge, heading = random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02)
         xi, nu = np.asarray([edge, heading, SPEED]), random.uniform(-1, 1, 2) * LIMIT
-        shares = control.FILTER_SCALES
+        shares = path_following.FILTER_SCALES
         margins = np.asarray([margin_of(xi, share * nu, ROAD) for share in shares])
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue
@@ -453,9 +453,9 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
         control=((-0.03, -1.0, -0.02, 8.0), (0.03, 1.0, 0.02, 10.0)),
     )
     measured = replace(certificate.measured, boxes=boxes)
-    made, shield = {}, control.Shield
+    made, shield = {}, path_following.Shield
     record = lambda **options: made.update(options) or shield(**options)
-    monkeypatch.setattr(control, "Shield", record)
+    monkeypatch.setattr(path_following, "Shield", record)
     in_corridor = partial(assembly.in_corridor, scripted(), TOY, kinematic(), LAW)
 
     def build_with(corridor):
@@ -495,7 +495,7 @@ def told(tamper, steps=120, disturbances=None, lag=lambda k: 0, **changes):
     """True xi and info where the vehicle's state is told wrong: (observation, k) -> it,
     or late: k -> steps.
     """
-    inner = control.Shield(
+    inner = path_following.Shield(
         inner=scripted(),
         model=TOY,
         law=LAW,
@@ -600,8 +600,8 @@ def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause
     """A push of the heading over 2 s, each step as small as the class's own."""
     pushed = np.random.default_rng(3).choice([-0.3, 0.3], (160, 3)) * DISTURBANCE
     pushed[40:60, 1] += 0.6 * DISTURBANCE[1]
-    weights = np.asarray(control.WINDOWS)[:, None]
-    test = control.InnovationTest(
+    weights = np.asarray(path_following.WINDOWS)[:, None]
+    test = path_following.InnovationTest(
         levels=jnp.zeros(1),
         deviation=jnp.asarray([*DISTURBANCE, DISTURBANCE[1]], float)[None],
         # The law knows no turn of the toy.
@@ -716,14 +716,14 @@ def test_a_car_stops_stands_and_starts_again_in_a_corridor_that_rolls_with_it(ca
 
     def run(key):
         road, sensors = sample(key), jax.random.split(key, 179)
-        at = jax.vmap(scenarios.point_at, in_axes=(None, 0))
+        at = jax.vmap(paths.point_at, in_axes=(None, 0))
         points = at(road.path, jnp.asarray(along, jnp.float32))
         points = points.at[:, 3].set(jnp.asarray(speed, jnp.float32))
 
         def step(carry, k):
             state, memory = carry
             window = jax.lax.dynamic_slice_in_dim(points, k + 1, HORIZON)
-            foot = scenarios.project(road.path, state[:2], jnp.asarray(along)[k])
+            foot = paths.project(road.path, state[:2], jnp.asarray(along)[k])
             seen = state + noise * jax.random.normal(sensors[k], state.shape)
             action, memory, info = shielded.act(
                 policy.params, memory, seen, road.envs[k], window

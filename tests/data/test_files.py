@@ -8,9 +8,8 @@ import pytest
 from pyarrow import parquet
 from recorded import NAMES, STATE, recorded_run, write_csv, write_npz
 
-from sfkd_jax import data as datasets
-from sfkd_jax.data import Columns
-from sfkd_jax.data._tables import read_csv
+from sfkd_jax.driving.logs import Columns, fingerprint, from_logs
+from sfkd_jax.driving.logs._tables import read_csv
 
 DT, STEPS = 0.1, 10
 
@@ -20,7 +19,7 @@ def read(path, columns=None, **options):
     lines = []
     options = {"report": lines.append} | options
     options = {"dt": DT, "wheelbase": 2.7, "steps": STEPS} | options
-    return datasets.from_logs(str(path), columns or Columns(), **options), lines
+    return from_logs(str(path), columns or Columns(), **options), lines
 
 
 def refusal(path, columns=None, **options):
@@ -475,11 +474,9 @@ def test_contents_decide_which_data_set_it_is(tmp_path):
         (tmp_path / folder).mkdir()
     write_csv(tmp_path / "here" / "a.csv", recorded_run())
     write_csv(tmp_path / "there" / "renamed.csv", recorded_run())
-    first, moved = (
-        datasets.fingerprint(str(tmp_path / folder)) for folder in ("here", "there")
-    )
+    first, moved = (fingerprint(str(tmp_path / folder)) for folder in ("here", "there"))
     write_csv(tmp_path / "here" / "a.csv", recorded_run(phase=0.1))
-    assert first == moved != datasets.fingerprint(str(tmp_path / "here"))
+    assert first == moved != fingerprint(str(tmp_path / "here"))
     write_csv(tmp_path / "there" / "twice.csv", recorded_run())
     assert "the same numbers as" in refusal(tmp_path / "there")
 

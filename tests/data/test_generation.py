@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, driver, generator, jit, segments
 
-from sfkd_jax import data as datasets
-from sfkd_jax import plants
+from sfkd_jax.driving import drives, plants
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +69,14 @@ def test_the_environment_covers_its_box(data):
 
 def test_no_key_is_used_twice():
     plant = plants.kinematic()
-    make = partial(datasets.generate, plant, driver(plant), segments=8, steps=5)
+    make = partial(drives.generate, plant, driver(plant), segments=8, steps=5)
     with jax.debug_key_reuse(True):
         jax.jit(make)(jax.random.key(0))
 
 
 def test_held_out_runs_meet_the_levels_of_s3_at_random_times():
     plant = plants.kinematic()
-    make = partial(datasets.generate, plant, driver(plant), segments=40, held_out=True)
+    make = partial(drives.generate, plant, driver(plant), segments=40, held_out=True)
     data = jax.tree.map(np.asarray, jit(make)(jax.random.key(0)))
     levels = {
         (round(float(mu), 3), abs(round(float(wind), 3)))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, any_law
 
-from sfkd_jax import plants
-from sfkd_jax.data import check_on_path, generate_along_path
-from sfkd_jax.scenarios import DriveClass, random_drive
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.drives import check_on_path, generate_along_path
+from sfkd_jax.driving.scenarios import DriveClass, random_drive
 from sfkd_jax.types import BODY, POSE
 
 PLANT = plants.kinematic()

@@ -9,7 +9,8 @@ import pytest
 from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, segments
 
 from sfkd_jax import data as datasets
-from sfkd_jax.data._segments import assign_parts
+from sfkd_jax.driving import drives
+from sfkd_jax.driving.logs._segments import assign_parts
 from sfkd_jax.rollout import windows
 from sfkd_jax.types import Trajectory
 
@@ -139,12 +140,12 @@ def test_scenarios_of_segments_stay_with_their_trajectories():
     data = dataset()
     for part in datasets.PARTS:
         windy = np.abs(np.asarray(getattr(data, part).envs)[..., 1]).max(axis=1) > 0
-        names = np.asarray(datasets.SCENARIOS)[np.asarray(data.scenarios[part])]
+        names = np.asarray(drives.SCENARIOS)[np.asarray(data.scenarios[part])]
         np.testing.assert_array_equal(names, np.where(windy, "wet", "uniform"))
     for count in (4, 7, 101):
-        labels = datasets.segment_scenarios(count, along_path=True)
+        labels = drives.segment_scenarios(count, along_path=True)
         assert len(labels) == count
-        assert set(labels) == set(range(len(datasets.SCENARIOS)))
+        assert set(labels) == set(range(len(drives.SCENARIOS)))
 
 
 RECORDED = (0.6, 0.1, 0.2, 0.1)

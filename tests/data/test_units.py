@@ -5,8 +5,8 @@ import pytest
 from recorded import recorded_run, write_csv, write_npz
 from test_files import read
 
-from sfkd_jax.data import Columns
-from sfkd_jax.data._column_names import find_column, find_unit
+from sfkd_jax.driving.logs import Columns
+from sfkd_jax.driving.logs._column_names import find_column, find_unit
 
 WITH_UNITS = {
     "t": ("t (ms)", 1e3),

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from helpers import at, jit, same
 
-from sfkd_jax import control, evaluation, models, plants, scenarios
-from sfkd_jax.evaluation import _loops, disturbed_environment
-from sfkd_jax.evaluation.metrics import SIGNALS
+from sfkd_jax import control, models
+from sfkd_jax.driving import path_following, paths, plants, scenarios, simulation
+from sfkd_jax.driving.simulation import _loops, disturbed_environment
+from sfkd_jax.driving.simulation.metrics import SIGNALS
 from sfkd_jax.info import ControllerInfo, PlanInfo
 from sfkd_jax.types import Controller
 
@@ -30,10 +31,10 @@ def roads():
 @cache
 def program(step):
     """(noise of the sensors, roads, keys) -> episodes planned with a step function."""
-    task = control.path_tracking(
+    task = path_following.path_tracking(
         models.physics(step),
-        control.tracking_cost(dt=DT),
-        control.path_feedback(wheelbase=PLANT.wheelbase),
+        path_following.tracking_cost(dt=DT),
+        path_following.path_feedback(wheelbase=PLANT.wheelbase),
         dt=DT,
         control_low=PLANT.control_low,
         control_high=PLANT.control_high,
@@ -41,7 +42,7 @@ def program(step):
     planner = control.mppi(task, num_samples=96, horizon=HORIZON)
 
     def one(noise, road, key):
-        return evaluation.simulate(
+        return simulation.simulate(
             PLANT.step,
             planner,
             {},
@@ -83,7 +84,7 @@ def test_an_episode_has_the_documented_shapes_and_the_states_of_the_plant():
 def test_lateral_deviation_and_progress_are_those_of_the_path():
     one, road = at(episodes(PLANT.step), 0), at(roads(), 0)
     points = np.asarray(
-        jit(jax.vmap(scenarios.point_at, in_axes=(None, 0)))(road.path, one.progress)
+        jit(jax.vmap(paths.point_at, in_axes=(None, 0)))(road.path, one.progress)
     )
     normals = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
     placed = points[:, :2] + np.asarray(one.lateral)[:, None] * normals
@@ -93,7 +94,7 @@ def test_lateral_deviation_and_progress_are_those_of_the_path():
 
 def test_the_oracle_drives_better_than_the_nominal_model_and_predicts_exactly():
     scores = [
-        evaluation.score(episodes(step), dt=DT, size=PLANT.size)
+        simulation.score(episodes(step), dt=DT, size=PLANT.size)
         for step in (PLANT.step, PLANT.nominal)
     ]
     assert np.all(scores[0]["rmse_m"] < scores[1]["rmse_m"])
@@ -121,7 +122,7 @@ def still(gain=1.0, planner_draws=1):
         return gain * observation[:2], state, info
 
     return partial(
-        evaluation.simulate,
+        simulation.simulate,
         lambda state, action, env: state,
         Controller(lambda key: key, act),
         {},
@@ -160,7 +161,7 @@ def test_no_key_is_used_twice_and_pushes_have_a_stream_of_their_own():
 # --- sensors of the environment ------------------------------------------------------
 
 ENVS = jnp.stack([jnp.linspace(0.9, 0.3, 300), jnp.linspace(-8.0, 8.0, 300)], axis=1)
-OBSERVE = partial(evaluation.observed_environment, ENVS, dt=DT)
+OBSERVE = partial(simulation.observed_environment, ENVS, dt=DT)
 
 
 def test_a_perfect_sensor_tells_the_truth_and_another_delays_or_biases_it(key):

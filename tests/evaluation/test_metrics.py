@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from sfkd_jax.evaluation import Episode, pool, row, score
+from sfkd_jax.driving.simulation import Episode, pool, row, score
+from sfkd_jax.driving.simulation.metrics import BY_NAME, METRICS, Recording, switches
 from sfkd_jax.evaluation.formats import DASH
-from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Recording, switches
 
 DT, STEPS = 0.1, 200
 CAR_SIZE = (4.5, 2.0)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from helpers import dataset, driven, jit, model_and_params
 
-from sfkd_jax import evaluation, models, plants
+from sfkd_jax import evaluation, models
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.experiment.identified import least_squares
-from sfkd_jax.path_coordinates import PATH_FRAME
 from sfkd_jax.types import Trajectory
 
 DT = 0.1

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfkd_jax.evaluation import compare, pool, row
-from sfkd_jax.evaluation.metrics import METRICS
+from sfkd_jax.driving.simulation import compare, pool, row
+from sfkd_jax.driving.simulation.metrics import METRICS
 
 
 def scored(level, count=4):

@@ -9,7 +9,8 @@ from helpers import any_law, space
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import assembly, models, plants
+from sfkd_jax import assembly, models, paper
+from sfkd_jax.driving import plants
 from sfkd_jax.experiment import command, evaluating
 
 CONF = Path(command.conf_path())
@@ -56,7 +57,7 @@ def test_every_controller_builds_on_every_vehicle(vehicle, controller):
     law = any_law(len(plant.state_names) - 1) if along else None
     model = assembly.reference_systems(plant, law)["oracle"].model
     if chosen.controller.planner == "koopman_mpc":  # it needs a linear predictor
-        model = models.FACTORIES["koopman_mpc"](space(len(plant.state_names) - 3))
+        model = paper.koopman(space(len(plant.state_names) - 3))
     controller = assembly.build_controller(chosen.controller, model, plant, law=law)
     state = jax.eval_shape(controller.init, jax.random.key(0))
     # It starts with a plan of two seconds for steering and acceleration.
@@ -64,7 +65,7 @@ def test_every_controller_builds_on_every_vehicle(vehicle, controller):
 
 
 def test_every_learned_model_and_every_planner_has_an_option_file():
-    assert set(models.FACTORIES) <= set(of("model"))
+    assert set(models.FACTORIES | paper.MODELS) <= set(of("model"))
     assert set(assembly.PLANNERS) <= set(of("controller"))
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from helpers import jit, space
 
-from sfkd_jax import models, plants
+from sfkd_jax import models
+from sfkd_jax.driving import plants
 from sfkd_jax.types import POSE
 
 LEARNED = ("neural_ode", "icode", "icode_mppi")

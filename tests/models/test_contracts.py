@@ -22,9 +22,9 @@ from helpers import (
     space,
 )
 
-from sfkd_jax import models
+from sfkd_jax import models, paper
 from sfkd_jax.geometry import compose
-from sfkd_jax.models.sfkd import RESIDUALS
+from sfkd_jax.models import RESIDUALS
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE, Structure, Trajectory
 
@@ -70,7 +70,7 @@ def one():
 
 
 def test_every_registered_model_is_tested_here():
-    assert {"sfkd", *OTHERS} == set(models.FACTORIES)
+    assert {"sfkd", *OTHERS} == set(models.FACTORIES | paper.MODELS)
     kinds = {variant.get("residual", "sandwich") for variant in VARIANTS.values()}
     assert kinds == set(RESIDUALS)
 

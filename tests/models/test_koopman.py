@@ -9,9 +9,9 @@ import pytest
 from helpers import at, dataset, jit, space
 
 from sfkd_jax import data as datasets
-from sfkd_jax import models
+from sfkd_jax import paper
 from sfkd_jax.geometry import compose
-from sfkd_jax.models._edmd import along_circle, ridge_regression
+from sfkd_jax.paper._edmd import along_circle, ridge_regression
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import POSE, Trajectory
 
@@ -104,7 +104,7 @@ def test_states_along_a_circle_have_the_coordinates_they_were_made_with(curvatur
 
 def test_a_plant_that_varies_with_the_environment_is_recovered():
     friction = 0.8
-    model = models.koopman(two_body_space(), functions=0, ridges=(1e-10,))
+    model = paper.koopman(two_body_space(), functions=0, ridges=(1e-10,))
     A, B, _, c = physical(
         model, identified(model, parked(switching_change)), [friction, -3.0]
     )
@@ -142,7 +142,7 @@ def test_regression_survives_columns_that_normal_equations_do_not():
 @cache
 def driving():
     """A model of the kinematic car and its parameters, from a few segments of driving."""
-    model = models.koopman(datasets.measure_space(dataset()), functions=30)
+    model = paper.koopman(datasets.measure_space(dataset()), functions=30)
     return model, jit(model.fitting.identify)(
         dataset().train, dataset().validation, KEY
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.plants import dynamic, kinematic
+from sfkd_jax.driving.plants import dynamic, kinematic
 
 # One object a setting, so one compilation.
 PLANTS = {"kinematic": cache(kinematic), "dynamic": cache(dynamic)}

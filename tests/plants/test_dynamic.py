@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from sfkd_jax.plants import kinematic
+from sfkd_jax.driving.plants import kinematic
 
 MASS, INERTIA, FRONT, REAR, C_FRONT, C_REAR = 1500.0, 2500.0, 1.2, 1.5, 9.0e4, 1.05e5
 HEIGHT, GRAVITY, LAG = 0.55, 9.81, 0.1

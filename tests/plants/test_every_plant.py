@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sfkd_jax.driving.plants import rk4, with_speed_loop
 from sfkd_jax.geometry import compose
-from sfkd_jax.plants import rk4, with_speed_loop
 from sfkd_jax.types import POSE
 
 

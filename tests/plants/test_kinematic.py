@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax.plants import kinematic, kinematic_stiff
+from sfkd_jax.driving.plants import kinematic, kinematic_stiff
 
 MASS, FRONT, REAR, LEVER = 1500.0, 1.2, 1.5, 0.4
 LENGTH = FRONT + REAR

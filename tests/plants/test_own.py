@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sfkd_jax import assembly, evaluation, plants
+from sfkd_jax import assembly
+from sfkd_jax.driving import plants, simulation
 
 NAMES = ("p_x", "p_y", "yaw", "v", "yaw_rate")
 LIMITS = {"control_low": (-1.0, -2.0), "control_high": (1.0, 2.0)}
@@ -70,6 +71,6 @@ def test_side_forces_need_a_plant_that_wind_acts_on(key):
         ValueError,
         match=r"side_forces act through the wind, but vehicle\.wind_force is 0",
     ):
-        evaluation.disturbed_environment(
+        simulation.disturbed_environment(
             plants.own(), jnp.zeros((3, 2)), key, largest=10.0
         )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax import plants
+from sfkd_jax.driving import plants
 from sfkd_jax.experiment import evaluating
 from tests.plants import simulators
 

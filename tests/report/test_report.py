@@ -13,10 +13,10 @@ import pages_of_runs as made
 import pytest
 from PIL import Image, ImageSequence
 
-from sfkd_jax.evaluation import Episode
-from sfkd_jax.evaluation.metrics import METRICS, Metric
-from sfkd_jax.lanes import Obstacles, lane_along
-from sfkd_jax.paths import path_through
+from sfkd_jax.driving.lanes import Obstacles, lane_along
+from sfkd_jax.driving.paths import path_through
+from sfkd_jax.driving.simulation import Episode
+from sfkd_jax.driving.simulation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import Film, LaneFilm, film_of

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax.scenarios import gusts, scenario, switching_road, uniform_road, wet_road
+from sfkd_jax.driving.scenarios import (
+    gusts,
+    scenario,
+    switching_road,
+    uniform_road,
+    wet_road,
+)
 
 STEPS, DT = 600, 0.1
 KEYS = jax.random.split(jax.random.key(7), 64)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from helpers import jit
 
-from sfkd_jax import scenarios
-from sfkd_jax.scenarios import (
+from sfkd_jax.driving import paths
+from sfkd_jax.driving.paths import (
     path_from_curvature,
     point_at,
     project,
     reference_window,
-    smooth_path,
 )
+from sfkd_jax.driving.scenarios import smooth_path
 
 RADIUS = 50.0
 POINTS = jit(jax.vmap(point_at, in_axes=(None, 0)))
@@ -147,7 +147,7 @@ def test_a_closed_path_goes_round_for_ever(repeated):
     """Distances, points and the window are the same in the second lap."""
     angle = np.linspace(0.0, 2 * np.pi, 3000, endpoint=repeated)
     points = 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])
-    lap = scenarios.path_through(jnp.asarray(points, jnp.float32), closed=True)
+    lap = paths.path_through(jnp.asarray(points, jnp.float32), closed=True)
     np.testing.assert_allclose(lap.length, 2 * np.pi * 60.0, rtol=1e-4)
     np.testing.assert_allclose(np.asarray(lap.points)[:, 3], 1 / 60.0, rtol=0.02)
     np.testing.assert_allclose(lap.points[0, :2], lap.points[-1, :2], atol=1e-4)
@@ -165,7 +165,7 @@ def test_a_closed_path_goes_round_for_ever(repeated):
 def test_a_path_through_positions_on_a_circle_is_that_circle():
     radius, angle = 40.0, np.linspace(0.0, 1.5, 400)
     points = np.column_stack([radius * np.sin(angle), radius * (1 - np.cos(angle))])
-    path = scenarios.path_through(jnp.asarray(points, dtype=jnp.float32))
+    path = paths.path_through(jnp.asarray(points, dtype=jnp.float32))
     inside = np.asarray(path.points)[3:-3]
     np.testing.assert_allclose(inside[:, 3], 1 / radius, rtol=0.02)
     np.testing.assert_allclose(
@@ -183,4 +183,4 @@ def test_a_path_through_positions_on_a_circle_is_that_circle():
 )
 def test_positions_that_make_no_path_are_refused(points, words):
     with pytest.raises(ValueError, match=words):
-        scenarios.path_through(jnp.asarray(points))
+        paths.path_through(jnp.asarray(points))

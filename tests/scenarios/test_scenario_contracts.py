@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, at, jit, same
 
-from sfkd_jax import scenarios
-from sfkd_jax.lanes import circles
+from sfkd_jax.driving import paths, scenarios
+from sfkd_jax.driving.lanes import circles
 
 EVERY = tuple(scenarios.ROADS)
 KEYS = jax.random.split(jax.random.key(7), 32)
@@ -76,7 +76,7 @@ def test_obstacles_stand_as_far_apart_as_asked_and_are_seen_when_the_car_is_near
     # All that are met in 60 s at 10 m/s are there.
     assert along[0] >= 70.0
     assert present[along < 600.0].all()
-    foot, aside = jit(jax.vmap(scenarios.project, in_axes=(None, 0, 0)))(
+    foot, aside = jit(jax.vmap(paths.project, in_axes=(None, 0, 0)))(
         made.path, every, course.along
     )
     np.testing.assert_allclose(foot[present], along[present], atol=0.05)

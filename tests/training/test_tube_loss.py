@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from helpers import TINY, any_law, jit
 
-from sfkd_jax import models, plants
-from sfkd_jax.data import generate_along_path, measure_space, random_windows, split
-from sfkd_jax.path_coordinates import PATH_FRAME
+from sfkd_jax import models
+from sfkd_jax.data import measure_space, random_windows, split
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.drives import generate_along_path
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import rollout
 from sfkd_jax.training import multi_step_loss
 from sfkd_jax.training._losses import power_mean

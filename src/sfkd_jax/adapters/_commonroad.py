@@ -16,7 +16,7 @@ from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std
 from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
-from sfkd_jax.plants import Vehicle, dynamic, simulator
+from sfkd_jax.driving.plants import Vehicle, dynamic, simulator
 from sfkd_jax.ranges import check_choice
 
 SLOWEST = 0.5

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sfkd_jax.adapters._task import DrivingTask, LaneTask, Moment
-from sfkd_jax.scenarios import Scenario
+from sfkd_jax.driving.scenarios import Scenario
 
 PROCESS = os.getpid()
 """The process that imported this file and started jax; a forked one inherits this."""

@@ -13,19 +13,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax import assembly
+from sfkd_jax.driving.paths import point_at, project, reference_window
+from sfkd_jax.driving.plants import Vehicle
+from sfkd_jax.driving.scenarios import Course, Family, Scenario, car_clearance, in_view
 from sfkd_jax.geometry import between, wrap_angle
-from sfkd_jax.plants import Vehicle
 from sfkd_jax.ranges import AtLeastOne, NonNegative, Positive, check_intervals
-from sfkd_jax.scenarios import (
-    Course,
-    Family,
-    Scenario,
-    car_clearance,
-    in_view,
-    point_at,
-    project,
-    reference_window,
-)
 from sfkd_jax.types import BODY, POSE, Control, Environment, Key, Scalar, State
 
 MEASURES: tuple[str, ...] = ("lateral", "speed_error", "steering_rate")

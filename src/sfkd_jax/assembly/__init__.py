@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import numpy as np
 
-from sfkd_jax import control, models, plants, scenarios
+from sfkd_jax import models, paper
 from sfkd_jax.assembly._consistency import check_consistent as check_consistent
 from sfkd_jax.assembly._consistency import check_imported as check_imported
 from sfkd_jax.assembly._controller_settings import (
@@ -40,8 +40,9 @@ from sfkd_jax.assembly._vehicles import VehicleSettings as VehicleSettings
 from sfkd_jax.assembly._vehicles import build_driver as build_driver
 from sfkd_jax.assembly._vehicles import build_vehicle as build_vehicle
 from sfkd_jax.assembly._vehicles import takes_logs as takes_logs
-from sfkd_jax.certificate import DrivingCertificate
-from sfkd_jax.path_coordinates import PATH_FRAME
+from sfkd_jax.driving import path_following, plants, scenarios
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -54,11 +55,11 @@ from sfkd_jax.settings import (
 )
 from sfkd_jax.types import BODY_FRAME, Model, Space
 
-MODELS = models.FACTORIES | {"own": models.own}
+MODELS = models.FACTORIES | paper.MODELS | {"own": models.own}
 """Factories of models by name; "own" is for a model from outside this package."""
 FRAMES = {frame.name: frame for frame in (BODY_FRAME, PATH_FRAME)}
 """Coordinates in which models are learned, by name."""
-LAW_MODELS = ("learned", "nominal", "plant", *control.TEXTBOOK)
+LAW_MODELS = ("learned", "nominal", "plant", *path_following.TEXTBOOK)
 """The models that a law of path coordinates may be derived from."""
 LAWS_ALONE = {f"law_{model}": model for model in LAW_MODELS}
 """System of an evaluation -> the model of the law that drives alone in it."""
@@ -165,20 +166,20 @@ def space_from_settings(settings: Values) -> Space:
     return Space(*jax.device_put(arrays))
 
 
-@takes(control.derive_path_law, skip=("coordinates", "env_low", "env_high"))
+@takes(path_following.derive_path_law, skip=("coordinates", "env_low", "env_high"))
 class LawSettings:
     """The law of path coordinates, as arguments of `derive_path_law`.
 
     Attributes:
         model: the model from whose steps the law is derived: "learned" from runs
             without a law; "nominal", the textbook bicycle, which knows no e; "plant",
-            the truth; or one of `control.TEXTBOOK`, the laws of textbooks.
+            the truth; or one of `path_following.TEXTBOOK`, the laws of textbooks.
     """
 
     model: Annotated[str, OneOf(LAW_MODELS)] = "plant"
 
 
-def build_loop(plant: plants.Vehicle, law: control.PathLaw) -> plants.Vehicle:
+def build_loop(plant: plants.Vehicle, law: path_following.PathLaw) -> plants.Vehicle:
     """Return the closed loop of plant and law, in path coordinates.
 
     See `plants.along_path`.
@@ -201,11 +202,11 @@ class System(NamedTuple):
     params: Any
     env_source: str
     certificate: DrivingCertificate | None = None
-    law: control.PathLaw | None = None
+    law: path_following.PathLaw | None = None
 
 
 def reference_systems(
-    plant: plants.Vehicle, law: control.PathLaw | None = None
+    plant: plants.Vehicle, law: path_following.PathLaw | None = None
 ) -> dict[str, System]:
     """Return the systems that need no learning, by name.
 

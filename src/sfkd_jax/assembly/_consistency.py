@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax import plants
 from sfkd_jax.assembly._vehicles import FROM_OUTSIDE
-from sfkd_jax.path_coordinates import PATH_SPEED
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.path_coordinates import PATH_SPEED
 from sfkd_jax.settings import Values
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sfkd_jax import control
+from sfkd_jax import control, paper
+from sfkd_jax.driving import path_following
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller
 
@@ -15,7 +16,7 @@ PLANNERS: dict[str, Callable[..., Controller]] = {
     "mppi": control.mppi,
     "cem": control.cem,
     "gradient": control.gradient_planner,
-    "koopman_mpc": control.koopman_mpc,
+    "koopman_mpc": paper.koopman_mpc,
 }
 """Planners by name. The settings of a controller hold those of its planner, which are
 its keyword-only arguments, under this name. A new planner is an entry here and a file
@@ -54,8 +55,8 @@ class ControllerSettings:
             `controller.PLANNER`, as in `controller.mppi`.
         sampling: "feedback" around the path-following law, "plain" around nothing,
             "law" around that of the path coordinates.
-        cost: of `control.tracking_cost`.
-        task: of `control.path_tracking`.
+        cost: of `path_following.tracking_cost`.
+        task: of `path_following.path_tracking`.
     """
 
     name: str
@@ -95,9 +96,9 @@ class SearchSettings(ControllerSettings):
     Attributes:
         shield: whether plans are kept inside the corridor of a certificate.
         adaptive: whether unmeasured forces are estimated while driving.
-        feedback: of `control.path_feedback`.
-        gate: of `control.Gate`.
-        adaptation: of `control.Adaptation`.
+        feedback: of `path_following.path_feedback`.
+        gate: of `path_following.Gate`.
+        adaptation: of `path_following.Adaptation`.
     """
 
     shield: bool = False
@@ -110,8 +111,8 @@ class SearchSettings(ControllerSettings):
 def _controller_schema(planner: str) -> type[ControllerSettings]:
     """Return the dataclass of a planner, with the settings of what is around it."""
     factories: dict[str, Callable[..., Any]] = {
-        "cost": control.tracking_cost,
-        "task": control.path_tracking,
+        "cost": path_following.tracking_cost,
+        "task": path_following.path_tracking,
     }
     if planner in QUADRATIC:
         base = ControllerSettings
@@ -120,17 +121,17 @@ def _controller_schema(planner: str) -> type[ControllerSettings]:
     else:
         base = SearchSettings
         skip = _NO_SETTINGS
-        factories["feedback"] = control.path_feedback
-        factories["gate"] = control.Gate
-        factories["adaptation"] = control.Adaptation
+        factories["feedback"] = path_following.path_feedback
+        factories["gate"] = path_following.Gate
+        factories["adaptation"] = path_following.Adaptation
     parts: dict[str, Any] = {
         part: schema(part.title(), object, factory, skip=(*skip, "horizon"))
         for part, factory in factories.items()
     }
     # What cost and task state is not stated by the planner once more.
     stated = {
-        *arguments(parts["cost"], control.tracking_cost),
-        *arguments(parts["task"], control.path_tracking),
+        *arguments(parts["cost"], path_following.tracking_cost),
+        *arguments(parts["task"], path_following.path_tracking),
     }
     of_planner = schema(
         "Planner", object, PLANNERS[planner], skip=(*_NO_SETTINGS, *stated)

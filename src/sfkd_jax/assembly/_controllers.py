@@ -6,15 +6,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfkd_jax import control, plants
+from sfkd_jax import control
 from sfkd_jax.assembly._controller_settings import (
     PLANNERS,
     ControllerSettings,
     SearchSettings,
 )
 from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
-from sfkd_jax.certificate import DrivingCertificate
-from sfkd_jax.path_coordinates import (
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.path_coordinates import (
     CURVATURE,
     HEADING,
     PATH_FRAME,
@@ -56,7 +57,7 @@ def build_controller(
     env_high: Corner = None,
     certificate: DrivingCertificate | None = None,
     env_source: str = "measured",
-    law: control.PathLaw | None = None,
+    law: path_following.PathLaw | None = None,
     adaptive: bool = False,
     planner: Controller | None = None,
 ) -> Controller:
@@ -139,7 +140,7 @@ class _Loop(NamedTuple):
 
     model: Model
     plant: plants.Vehicle
-    law: control.PathLaw
+    law: path_following.PathLaw
     env_box: dict[str, Any]
     estimates_env: bool
 
@@ -154,12 +155,12 @@ def _limits(plant: plants.Vehicle) -> dict[str, Any]:
     return {"control_low": plant.control_low, "control_high": plant.control_high}
 
 
-def _cost(settings: ControllerSettings, plant: plants.Vehicle) -> control.Cost:
+def _cost(settings: ControllerSettings, plant: plants.Vehicle) -> path_following.Cost:
     """Return the cost of tracking a reference."""
-    return control.tracking_cost(
+    return path_following.tracking_cost(
         dt=plant.dt,
         speed_loop=plant.speed_loop,
-        **arguments(settings.cost, control.tracking_cost),
+        **arguments(settings.cost, path_following.tracking_cost),
     )
 
 
@@ -188,22 +189,22 @@ def _tracking_task(
     settings: SearchSettings, model: Model, plant: plants.Vehicle
 ) -> control.Task:
     """Return the task of tracking a path around the law that `sampling` names."""
-    feedback = control.path_feedback(
+    feedback = path_following.path_feedback(
         wheelbase=plant.wheelbase,
         speed_loop=plant.speed_loop,
-        **arguments(settings.feedback, control.path_feedback),
+        **arguments(settings.feedback, path_following.path_feedback),
     )
     laws = {
         "feedback": feedback,
-        "plain": control.no_feedback(speed_loop=plant.speed_loop),
+        "plain": path_following.no_feedback(speed_loop=plant.speed_loop),
     }
-    return control.path_tracking(
+    return path_following.path_tracking(
         model.planning or model,
         _cost(settings, plant),
         choose(laws, settings.sampling, "controller.sampling"),
         dt=plant.dt,
         **_limits(plant),
-        **arguments(settings.task, control.path_tracking),
+        **arguments(settings.task, path_following.path_tracking),
     )
 
 
@@ -221,13 +222,13 @@ def _planner_along_path(
     predicts = loop.model.planning or loop.model
     if adaptive:
         predicts = with_offset(predicts)
-    task = control.following_law(
+    task = path_following.following_law(
         predicts,
         _cost(settings, loop.plant),
         loop.law,
         dt=loop.plant.dt,
         **_limits(loop.plant),
-        **arguments(settings.task, control.following_law),
+        **arguments(settings.task, path_following.following_law),
     )
     factory = PLANNERS[settings.planner]
     options = arguments(settings.planner_settings, factory)
@@ -239,12 +240,12 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
     # The filter relates forces to the largest one in E, which the box defines.
     if None in loop.env_box.values():
         raise ValueError("adaptation needs environment.low and environment.high")
-    options = arguments(settings.adaptation, control.Adaptation)
+    options = arguments(settings.adaptation, path_following.Adaptation)
     if not options["sensor_noise"]:
         options["sensor_noise"] = _noise_to_learn_from(loop.plant)
     if not options["model_error"]:
         options["model_error"] = _error_of_known_states(loop.plant)
-    adaptation = control.Adaptation(
+    adaptation = path_following.Adaptation(
         inner=inner,
         # Without the offset, which the filter itself adds.
         model=loop.model.planning or loop.model,
@@ -293,10 +294,10 @@ def _along_reference(
     test = None
     if corridor is not None and not loop.estimates_env:
         calibrated = corridor.innovations
-        test = control.innovation_test(
+        test = path_following.innovation_test(
             calibrated.levels, calibrated.deviation, calibrated.threshold
         )
-    gate = control.Gate(
+    gate = path_following.Gate(
         inner=inner,
         model=loop.model,
         law=loop.law,
@@ -305,17 +306,17 @@ def _along_reference(
         conditions=conditions_of(certificate, **loop.env_box),
         reads_env=not loop.estimates_env,
         test=test,
-        **arguments(settings.gate, control.Gate),
+        **arguments(settings.gate, path_following.Gate),
     )
     # Here and nowhere else observation and reference become ξ and preview.
     coordinates = loop.law.gain.shape[-1]
-    return control.along_reference(gate.controller(), coordinates=coordinates)
+    return path_following.along_reference(gate.controller(), coordinates=coordinates)
 
 
 def build_in_lane(
     inner: Controller,
     plant: plants.Vehicle,
-    law: control.PathLaw,
+    law: path_following.PathLaw,
     certificate: DrivingCertificate,
     *,
     horizon: int,
@@ -323,7 +324,7 @@ def build_in_lane(
     planner: str,
     friction: int | None,
 ) -> Controller:
-    """Return a controller that drives in a lane, see `control.InLane`.
+    """Return a controller that drives in a lane, see `path_following.InLane`.
 
     Args:
         inner: the shielded controller of references.
@@ -336,10 +337,10 @@ def build_in_lane(
         friction: entry of e that is the friction; None if none is.
     """
     admissible = _admissible_references(plant, law, certificate, car)
-    manoeuvres = control.Manoeuvres(kind=admissible, dt=plant.dt)
+    manoeuvres = path_following.Manoeuvres(kind=admissible, dt=plant.dt)
     options = {**REFERENCE_SEARCH, **REFERENCE_PLANNERS.get(planner, {})}
     speed_gain = float(np.mean(law.gain[..., 1, PATH_SPEED]))
-    return control.in_lane(
+    return path_following.in_lane(
         inner=inner,
         planner=PLANNERS[planner](manoeuvres.task(), **options),
         manoeuvres=manoeuvres,
@@ -352,10 +353,10 @@ def build_in_lane(
 
 def _admissible_references(
     plant: plants.Vehicle,
-    law: control.PathLaw,
+    law: path_following.PathLaw,
     certificate: DrivingCertificate,
     car: tuple[float, float],
-) -> control.Class:
+) -> path_following.Class:
     """Return the class of references of which a corridor was certified."""
     corridor = corridor_of(certificate)
     conditions = corridor.conditions
@@ -364,7 +365,7 @@ def _admissible_references(
     heading = 0.0
     if state_box is not None:
         heading = max(abs(end[HEADING]) for end in state_box)
-    return control.Class(
+    return path_following.Class(
         curvature=min(conditions.peak_curvature, road_high[CURVATURE]),
         turning=conditions.curvature_slope,
         lateral=min(conditions.lateral_acceleration, float(law.high[0])),

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax import control, plants
-from sfkd_jax.certificate import Corridor, DrivingCertificate
-from sfkd_jax.path_coordinates import HEADING, LATERAL
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
+from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
@@ -41,13 +41,13 @@ def in_corridor(
     planner: Controller,
     model: Model,
     plant: plants.Vehicle,
-    law: control.PathLaw,
+    law: path_following.PathLaw,
     certificate: DrivingCertificate,
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
     Args:
-        planner: any controller along a path, see `control.along_reference`.
+        planner: any controller along a path, see `path_following.along_reference`.
         model: in path coordinates.
         plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
@@ -59,7 +59,7 @@ def in_corridor(
     # What the heading's noise moves the car sideways until the law has turned it back.
     steering = np.asarray(law.gain)[..., 0, :]
     ratio = float(np.max(steering[..., HEADING] / steering[..., LATERAL]))
-    return control.Shield(
+    return path_following.Shield(
         inner=planner,
         model=model,
         law=law,
@@ -77,7 +77,7 @@ def in_corridor(
     ).controller()
 
 
-def _slip_of_gentle_turns(law: control.PathLaw) -> float:
+def _slip_of_gentle_turns(law: path_following.PathLaw) -> float:
     """Return the slip of a turn that the tyres hardly feel, per curvature [m].
 
     At one lateral acceleration ψ* differs between two speeds by this times κ alone.
@@ -105,7 +105,7 @@ def conditions_of(
     *,
     env_low: Corner = None,
     env_high: Corner = None,
-) -> control.Conditions:
+) -> path_following.Conditions:
     """Return where the model predicts, as its certificate says.
 
     Without a certificate nothing is known of this but the box of e.
@@ -113,11 +113,11 @@ def conditions_of(
     if certificate:
         return _certified_conditions(certificate)
     if env_low is None or env_high is None:
-        return control.Conditions()
-    return control.Conditions(env=_box(env_low, env_high))
+        return path_following.Conditions()
+    return path_following.Conditions(env=_box(env_low, env_high))
 
 
-def _certified_conditions(certificate: DrivingCertificate) -> control.Conditions:
+def _certified_conditions(certificate: DrivingCertificate) -> path_following.Conditions:
     """Return the boxes of a certificate, somewhat enlarged.
 
     The box of e_y contains the corridor, since the claim holds there, whether or not
@@ -140,7 +140,7 @@ def _certified_conditions(certificate: DrivingCertificate) -> control.Conditions
     # [2:] are κ and v_ref; ν has its limits in the law.
     road_low, road_high = np.asarray(boxes.control, float)[:, 2:]
     env_low, env_high = boxes.env
-    return control.Conditions(
+    return path_following.Conditions(
         env=_box(env_low, env_high),
         state=_box(low, high),
         road=_box(
@@ -150,6 +150,6 @@ def _certified_conditions(certificate: DrivingCertificate) -> control.Conditions
     )
 
 
-def _box(low: Any, high: Any) -> control.Box:
+def _box(low: Any, high: Any) -> path_following.Box:
     """Return limits as plain numbers."""
     return tuple(map(float, low)), tuple(map(float, high))

@@ -7,8 +7,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from sfkd_jax import control, models, plants, store
-from sfkd_jax.data import Columns, Driver, from_logs
+from sfkd_jax import models, store
+from sfkd_jax.driving import path_coordinates, path_following, plants
+from sfkd_jax.driving.drives import Driver
+from sfkd_jax.driving.logs import Columns, from_logs
 from sfkd_jax.ranges import Positive, imported
 from sfkd_jax.settings import OneOf, Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Control, Reference, Space, State, Step
@@ -55,7 +57,7 @@ takes_logs = takes(
     skip=(*_KNOWN_FROM_VEHICLE, "env_low", "env_high"),
     columns=schema("Columns", object, Columns),
 )
-"""Makes a class a dataclass with the arguments of `data.from_logs`."""
+"""Makes a class a dataclass with the arguments of `logs.from_logs`."""
 
 
 @takes_logs
@@ -138,11 +140,13 @@ def _read_identified(file: str) -> Step:
 def build_driver(plant: plants.Vehicle) -> Driver:
     """Return the path-following law that drives while data are collected."""
     # Linear: it is part of every data set of a seed.
-    law = control.LinearFeedback(wheelbase=plant.wheelbase, speed_loop=plant.speed_loop)
+    law = path_following.LinearFeedback(
+        wheelbase=plant.wheelbase, speed_loop=plant.speed_loop
+    )
 
     def driver(state: State, reference: Reference) -> Control:
-        curvature = control.reference_curvature(reference)[0]
-        errors = control.path_errors(state, reference[0], curvature)
+        curvature = path_coordinates.reference_curvature(reference)[0]
+        errors = path_following.path_errors(state, reference[0], curvature)
         return law(errors, curvature, reference[0, 3])
 
     return driver

@@ -32,17 +32,3 @@ from sfkd_jax.certificate._signature import describe_signature as describe_signa
 from sfkd_jax.certificate._signature import is_signed as is_signed
 from sfkd_jax.certificate._signature import private_key as private_key
 from sfkd_jax.certificate._signature import public_key_of as public_key_of
-
-# isort: split
-# Of a policy that drives:
-from sfkd_jax.certificate._corridor import Bounds as Bounds
-from sfkd_jax.certificate._corridor import Conditions as Conditions
-from sfkd_jax.certificate._corridor import Corridor as Corridor
-from sfkd_jax.certificate._corridor import CorridorAttack as CorridorAttack
-from sfkd_jax.certificate._corridor import GroupBounds as GroupBounds
-from sfkd_jax.certificate._corridor import Innovations as Innovations
-from sfkd_jax.certificate._corridor import JointBounds as JointBounds
-from sfkd_jax.certificate._corridor import Recorded as Recorded
-from sfkd_jax.certificate._corridor import RecordedConditions as RecordedConditions
-from sfkd_jax.certificate._corridor import Seen as Seen
-from sfkd_jax.certificate._driving import DrivingCertificate as DrivingCertificate

@@ -15,11 +15,7 @@ import numpy as np
 import scipy
 
 from sfkd_jax.certificate import Box, Claims
-from sfkd_jax.certification._claims import (
-    FLOAT32,
-    attack_limits,
-    decoders,
-)
+from sfkd_jax.certification._claims import FLOAT32, attack_limits, decoders
 from sfkd_jax.certification._core import Matrix, Vector
 from sfkd_jax.certification._weights import CertificationRefused, Exported, one_thread
 from sfkd_jax.rollout import fold, on_host

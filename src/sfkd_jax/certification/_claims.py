@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax.certificate import Box, Claims, Multipliers
-from sfkd_jax.certification._core import (
-    Matrix,
-    Vector,
-    check_vertices,
-    check_witness,
-)
+from sfkd_jax.certification._core import Matrix, Vector, check_vertices, check_witness
 from sfkd_jax.certification._weights import Exported, require, require_all
 
 COMPILATION_SLACK = 1.0 + 1e-6

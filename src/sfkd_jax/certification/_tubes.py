@@ -11,19 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.certificate import (
-    OutputBound,
-    OutputMetric,
-    OutputTube,
-    StepErrors,
-    Tube,
-)
+from sfkd_jax.certificate import OutputBound, OutputMetric, OutputTube, StepErrors, Tube
 from sfkd_jax.certification._claims import rows
-from sfkd_jax.certification._measured import (
-    Residuals,
-    conformal_quantile,
-    coverage_of,
-)
+from sfkd_jax.certification._measured import Residuals, conformal_quantile, coverage_of
 from sfkd_jax.certification._metric_claims import OUTPUTS
 
 RADII = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}

@@ -1,56 +1,27 @@
-"""Controllers: tasks, planners, feedback laws and wrappers, for any dynamics."""
+"""Planners, and the tasks that they solve, for any dynamics."""
 
+from sfkd_jax.control._factory import Stateful as Stateful
 from sfkd_jax.control._factory import factory as factory
-from sfkd_jax.control.lanes._in_lane import InLane as InLane
-from sfkd_jax.control.lanes._in_lane import in_lane as in_lane
-from sfkd_jax.control.lanes._judging import Class as Class
-from sfkd_jax.control.lanes._manoeuvre import Manoeuvres as Manoeuvres
-from sfkd_jax.control.laws._derivation import derive_path_law as derive_path_law
-from sfkd_jax.control.laws._feedback import LinearFeedback as LinearFeedback
-from sfkd_jax.control.laws._feedback import PathErrors as PathErrors
-from sfkd_jax.control.laws._feedback import no_feedback as no_feedback
-from sfkd_jax.control.laws._feedback import path_errors as path_errors
-from sfkd_jax.control.laws._feedback import path_feedback as path_feedback
-from sfkd_jax.control.laws._path_law import TEXTBOOK as TEXTBOOK
-from sfkd_jax.control.laws._path_law import PathLaw as PathLaw
-from sfkd_jax.control.laws._path_law import law_from_arrays as law_from_arrays
-from sfkd_jax.control.laws._path_law import textbook_law as textbook_law
-from sfkd_jax.control.laws._steady_turn import NEAR as NEAR
+from sfkd_jax.control._finite import all_finite as all_finite
+from sfkd_jax.control._task import Limiter as Limiter
+from sfkd_jax.control._task import PlanningStart as PlanningStart
+from sfkd_jax.control._task import RolloutSetup as RolloutSetup
+from sfkd_jax.control._task import Sample as Sample
+from sfkd_jax.control._task import StepIndex as StepIndex
+from sfkd_jax.control._task import StepResult as StepResult
+from sfkd_jax.control._task import Task as Task
+from sfkd_jax.control._task import actuator_limits as actuator_limits
+from sfkd_jax.control._task import at_step as at_step
+from sfkd_jax.control._task import constrained as constrained
+from sfkd_jax.control._task import free_task as free_task
+from sfkd_jax.control._task import outside_boxes as outside_boxes
+from sfkd_jax.control._task import outside_circles as outside_circles
 from sfkd_jax.control.planners._cem import cem as cem
 from sfkd_jax.control.planners._gradient import gradient_planner as gradient_planner
-from sfkd_jax.control.planners._koopman_mpc import koopman_mpc as koopman_mpc
 from sfkd_jax.control.planners._mppi import mppi as mppi
+from sfkd_jax.control.planners._planner import Evaluate as Evaluate
 from sfkd_jax.control.planners._planner import Planner as Planner
 from sfkd_jax.control.planners._planner import SearchResult as SearchResult
+from sfkd_jax.control.planners._planner import Tuning as Tuning
 from sfkd_jax.control.planners._planner import tuned as tuned
-from sfkd_jax.control.tasks._along_path import along_reference as along_reference
-from sfkd_jax.control.tasks._along_path import following_law as following_law
-from sfkd_jax.control.tasks._path_tracking import Cost as Cost
-from sfkd_jax.control.tasks._path_tracking import StageInputs as StageInputs
-from sfkd_jax.control.tasks._path_tracking import path_tracking as path_tracking
-from sfkd_jax.control.tasks._path_tracking import tracking_cost as tracking_cost
-from sfkd_jax.control.tasks._task import RolloutSetup as RolloutSetup
-from sfkd_jax.control.tasks._task import Sample as Sample
-from sfkd_jax.control.tasks._task import StepResult as StepResult
-from sfkd_jax.control.tasks._task import Task as Task
-from sfkd_jax.control.tasks._task import at_step as at_step
-from sfkd_jax.control.tasks._task import constrained as constrained
-from sfkd_jax.control.tasks._task import free_task as free_task
-from sfkd_jax.control.tasks._task import outside_boxes as outside_boxes
-from sfkd_jax.control.tasks._task import outside_circles as outside_circles
-from sfkd_jax.control.tasks._world_planner import in_the_world as in_the_world
-from sfkd_jax.control.wrappers._adaptation import Adaptation as Adaptation
-from sfkd_jax.control.wrappers._conditions import Box as Box
-from sfkd_jax.control.wrappers._conditions import Conditions as Conditions
-from sfkd_jax.control.wrappers._gate import Gate as Gate
-from sfkd_jax.control.wrappers._innovations import WINDOWS as WINDOWS
-from sfkd_jax.control.wrappers._innovations import InnovationTest as InnovationTest
-from sfkd_jax.control.wrappers._innovations import (
-    expected_coordinates as expected_coordinates,
-)
-from sfkd_jax.control.wrappers._innovations import innovation_test as innovation_test
-from sfkd_jax.control.wrappers._innovations import turning_rate as turning_rate
-from sfkd_jax.control.wrappers._safety_filter import FILTER_SCALES as FILTER_SCALES
-from sfkd_jax.control.wrappers._safety_filter import safety_filter as safety_filter
-from sfkd_jax.control.wrappers._shield import Shield as Shield
-from sfkd_jax.path_coordinates import reference_curvature as reference_curvature
+from sfkd_jax.control.planners._rollouts import Plan as Plan

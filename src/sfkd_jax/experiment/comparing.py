@@ -13,8 +13,9 @@ from hydra.errors import HydraException
 from jax.errors import JaxRuntimeError
 from omegaconf.errors import OmegaConfBaseException
 
-from sfkd_jax import evaluation, store
-from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax import store
+from sfkd_jax.driving import simulation
+from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import command, evaluating, run_directory, stages
 from sfkd_jax.experiment.evaluating import EpisodeSet, SystemResult
 from sfkd_jax.experiment.options import ComparisonSettings, Settings
@@ -207,8 +208,8 @@ def collect_rows(
     for cell, trainings in pooled.items():
         if trainings:
             with store.as_artefact_error(cell.path(directory)):
-                rows.append(evaluation.pool(trainings))
-    return evaluation.compare(rows, missing=len(pooled) - len(rows))
+                rows.append(simulation.pool(trainings))
+    return simulation.compare(rows, missing=len(pooled) - len(rows))
 
 
 def _print_count(paths: list[Path], reason: str) -> None:

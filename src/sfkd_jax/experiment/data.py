@@ -10,18 +10,17 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import assembly, store
-from sfkd_jax.data import (
+from sfkd_jax.data import Dataset, split
+from sfkd_jax.driving.drives import (
     SCENARIOS,
-    Dataset,
     check_on_path,
     generate,
     generate_along_path,
     segment_scenarios,
-    split,
 )
+from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.experiment.laws import without_faults
 from sfkd_jax.experiment.options import DatasetSettings
-from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import arguments
 from sfkd_jax.types import Key, Trajectory
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from sfkd_jax import store
 from sfkd_jax.assembly import LoggedVehicleSettings, VehicleSettings
-from sfkd_jax.data import PARTS, Dataset, environment_box, fingerprint
+from sfkd_jax.data import PARTS, Dataset, environment_box
+from sfkd_jax.driving.logs import fingerprint
 from sfkd_jax.experiment.options import DatasetSettings, EnvironmentSettings
 from sfkd_jax.types import Trajectory
 

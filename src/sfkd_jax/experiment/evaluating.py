@@ -15,14 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sfkd_jax import assembly, evaluation, policy, store
+from sfkd_jax import assembly, policy, store
 from sfkd_jax.assembly import ScenarioSettings, System
-from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax.driving import simulation
+from sfkd_jax.driving.scenarios import COURSES, Scenario
+from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.rollout import fold, on_host, unfold
-from sfkd_jax.scenarios import COURSES, Scenario
 from sfkd_jax.settings import arguments, choose
 from sfkd_jax.types import Controller, Key, Params
 
@@ -62,12 +63,12 @@ def make_episodes(run: Run) -> EpisodeSet:
     family = assembly.build_scenario(
         settings.scenario, plant, duration=protocol.episode_s, **run.source.box
     )
-    sensor = arguments(settings.environment.sensor, evaluation.observed_environment)
+    sensor = arguments(settings.environment.sensor, simulation.observed_environment)
 
     @jax.jit
     def draw(keys: Array, sensor_keys: Array) -> Scenario:
         scenarios = jax.vmap(family)(keys)
-        observe = partial(evaluation.observed_environment, dt=plant.dt, **sensor)
+        observe = partial(simulation.observed_environment, dt=plant.dt, **sensor)
         observed = jax.vmap(observe)(scenarios.envs, sensor_keys)
         return scenarios._replace(observed_envs=observed)
 
@@ -80,8 +81,8 @@ def make_episodes(run: Run) -> EpisodeSet:
 
 
 def _over_episodes(
-    run: Callable[[Params, Scenario, Key], evaluation.Episode],
-) -> Callable[[Params, Scenario, Key], evaluation.Episode]:
+    run: Callable[[Params, Scenario, Key], simulation.Episode],
+) -> Callable[[Params, Scenario, Key], simulation.Episode]:
     """Compile the simulation of one episode for a batch of them.
 
     Accelerators run all at once. A core runs one after the other, so that the samples
@@ -93,7 +94,7 @@ def _over_episodes(
     compiled = jax.jit(run)
     cores = _available_cores()
 
-    def run_all(params: Params, scenarios: Scenario, keys: Array) -> evaluation.Episode:
+    def run_all(params: Params, scenarios: Scenario, keys: Array) -> simulation.Episode:
         count = len(keys)
         inputs = [
             (params, *jax.tree.map(lambda leaf, i=i: leaf[i], (scenarios, keys)))
@@ -102,7 +103,7 @@ def _over_episodes(
         # Ahead of the threads, which would compile the same program side by side.
         program = compiled.lower(*inputs[0]).compile()
 
-        def run_one(inputs_of_one: tuple[Any, ...]) -> evaluation.Episode:
+        def run_one(inputs_of_one: tuple[Any, ...]) -> simulation.Episode:
             return jax.block_until_ready(program(*inputs_of_one))
 
         pool = ThreadPoolExecutor(min(count, cores))
@@ -193,7 +194,7 @@ class SystemEvaluation:
         self.params = fold(system.model, system.params, on_host)
         self._columns = _columns(settings, name, system)
         simulate = partial(
-            evaluation.simulate,
+            simulation.simulate,
             plant.step,
             self.controller,
             horizon=settings.controller.horizon,
@@ -206,14 +207,14 @@ class SystemEvaluation:
     def __call__(self, episodes: EpisodeSet) -> SystemResult:
         """Simulate and score one set of episodes, without and with side forces."""
         episode, scores = self._scored(episodes, 0.0)
-        row = evaluation.row(scores, {**self._columns, "scenario": episodes.name})
+        row = simulation.row(scores, {**self._columns, "scenario": episodes.name})
         if self._side_forces:
             row["disturbed"] = []
         for force in self._side_forces:
             # Without a force the episodes are those above, and not simulated again.
             if force:
                 _, scores = self._scored(episodes, force)
-            row["disturbed"].append(evaluation.disturbed(force, scores))
+            row["disturbed"].append(simulation.disturbed(force, scores))
         arrays = {
             "lateral": episode.lateral,
             "states": episode.states,
@@ -227,7 +228,7 @@ class SystemEvaluation:
 
     def _scored(
         self, episodes: EpisodeSet, force: float
-    ) -> tuple[evaluation.Episode, evaluation.Scores]:
+    ) -> tuple[simulation.Episode, simulation.Scores]:
         """Simulate episodes under unmeasured side forces, and score them.
 
         Args:
@@ -237,12 +238,12 @@ class SystemEvaluation:
         scenarios = episodes.scenarios
         if force:
             disturb = partial(
-                evaluation.disturbed_environment, self._plant, largest=force
+                simulation.disturbed_environment, self._plant, largest=force
             )
             envs = jax.jit(jax.vmap(disturb))(scenarios.envs, episodes.keys)
             scenarios = scenarios._replace(envs=envs)
         episode = self._simulate(self.params, scenarios, episodes.keys)
-        scores = evaluation.score(episode, dt=self._plant.dt, size=self._plant.size)
+        scores = simulation.score(episode, dt=self._plant.dt, size=self._plant.size)
         return episode, scores
 
 
@@ -357,5 +358,5 @@ def drive(
         error = result.row["rmse_m"]["mean"]
         worst = result.row["max_deviation_m"]
         store.print_message(f"  rmse {error:.4f} m, worst {worst:.3f} m")
-    evaluation.compare([result.row for result in results])
+    simulation.compare([result.row for result in results])
     return results

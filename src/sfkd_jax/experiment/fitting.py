@@ -10,13 +10,8 @@ import jax
 import numpy as np
 
 from sfkd_jax import policy, store
-from sfkd_jax.data import (
-    SCENARIOS,
-    Dataset,
-    measure_space,
-    random_windows,
-    spread_windows,
-)
+from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
+from sfkd_jax.driving.drives import SCENARIOS
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.options import TrainingSettings

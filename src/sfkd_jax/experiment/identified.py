@@ -13,19 +13,11 @@ import numpy as np
 
 from sfkd_jax import assembly, models, store
 from sfkd_jax.assembly import LoggedVehicleSettings
-from sfkd_jax.data import (
-    PARTS,
-    Columns,
-    Dataset,
-    LoggedDataset,
-    fingerprint,
-    from_logs,
-    measure_space,
-    random_windows,
-)
+from sfkd_jax.data import PARTS, Dataset, measure_space, random_windows
+from sfkd_jax.driving.logs import Columns, LoggedDataset, fingerprint, from_logs
+from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.experiment.options import EnvironmentSettings, LogSettings, Settings
-from sfkd_jax.plants import Vehicle
 from sfkd_jax.settings import arguments, replace
 from sfkd_jax.training import descend, one_step_loss
 from sfkd_jax.types import Key, Model, Params, Step

@@ -14,17 +14,18 @@ import numpy as np
 
 from sfkd_jax import models, store
 from sfkd_jax.assembly import LOGGED
-from sfkd_jax.control import (
+from sfkd_jax.data import split
+from sfkd_jax.driving.drives import generate_along_path, generate_open_loop
+from sfkd_jax.driving.path_following import (
     TEXTBOOK,
     PathLaw,
     derive_path_law,
     law_from_arrays,
     textbook_law,
 )
-from sfkd_jax.data import generate_along_path, generate_open_loop, split
+from sfkd_jax.driving.plants import Vehicle, along_path
 from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.options import AlongPathSettings
-from sfkd_jax.plants import Vehicle, along_path
 from sfkd_jax.settings import arguments
 from sfkd_jax.types import BODY, Key, Step, Trajectory
 
@@ -161,7 +162,7 @@ def _best_textbook_law(simulate: _Simulation, law: PathLaw, name: str) -> PathLa
     Args:
         simulate: what the law is for.
         law: whose steady turns the law of the textbook shares.
-        name: of the textbook's law, in `control.TEXTBOOK`.
+        name: of the textbook's law, in `path_following.TEXTBOOK`.
     """
     plant = simulate.plant
     lateral_error = _lateral_error(simulate, plant.step)

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from sfkd_jax import assembly, data, evaluation, export, training
+from sfkd_jax import assembly, export, training
 from sfkd_jax.assembly import (
     ControllerSettings,
     Directory,
@@ -17,8 +17,10 @@ from sfkd_jax.assembly import (
     VehicleSettings,
 )
 from sfkd_jax.certification import measure, prove
-from sfkd_jax.certification.corridor import measure_corridor
-from sfkd_jax.plants import KNOWN_STATES, Vehicle, described
+from sfkd_jax.driving import drives, simulation
+from sfkd_jax.driving.corridor import measure_corridor
+from sfkd_jax.driving.plants import KNOWN_STATES, Vehicle, described
+from sfkd_jax.driving.scenarios import DriveClass
 from sfkd_jax.ranges import (
     Bounds,
     Fraction,
@@ -29,7 +31,6 @@ from sfkd_jax.ranges import (
     NonNegativeInt,
     Numbers,
 )
-from sfkd_jax.scenarios import DriveClass
 from sfkd_jax.settings import OneOf, Values, arguments, parse, replace, schema, takes
 
 Overrides = dict[str, str | None]
@@ -41,7 +42,7 @@ _BOX = ("env_low", "env_high")
 """Arguments of factories that the settings of the environment decide."""
 
 
-@takes(sensor=schema("Sensor", object, evaluation.observed_environment, skip=("dt",)))
+@takes(sensor=schema("Sensor", object, simulation.observed_environment, skip=("dt",)))
 class EnvironmentSettings:
     """What surrounds the vehicle: e in its box, and how a controller learns of it.
 
@@ -104,13 +105,13 @@ class DatasetSettings:
         return SimulatedSettings
 
 
-@takes(data.generate, skip=("held_out", *_BOX))
+@takes(drives.generate, skip=("held_out", *_BOX))
 class SimulatedSettings(DatasetSettings):
     """Simulated data; the other fields are arguments of the generator."""
 
 
 @takes(
-    data.generate_along_path,
+    drives.generate_along_path,
     DriveClass,
     skip=("limits", "held_out", *_BOX),
     law=LawSettings,
@@ -126,15 +127,15 @@ class AlongPathSettings(DatasetSettings):
 
     @property
     def options(self) -> dict[str, Any]:
-        """The arguments of `data.generate_along_path`."""
-        options = arguments(self, data.generate_along_path)
+        """The arguments of `drives.generate_along_path`."""
+        options = arguments(self, drives.generate_along_path)
         options["limits"] = DriveClass(**arguments(self, DriveClass))
         return options
 
 
 @assembly.takes_logs
 class LogSettings(DatasetSettings):
-    """Recorded logs; the other fields are arguments of `data.from_logs`."""
+    """Recorded logs; the other fields are arguments of `from_logs`."""
 
     path: str
     columns: Any

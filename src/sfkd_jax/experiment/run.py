@@ -9,14 +9,14 @@ from typing import Any
 
 from sfkd_jax import store
 from sfkd_jax.certification import boxes_of
-from sfkd_jax.certification.corridor import check_count
-from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset
+from sfkd_jax.driving.corridor import check_count
+from sfkd_jax.driving.path_following import PathLaw
+from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import train_policy
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.experiment.source import DataSource
-from sfkd_jax.plants import Vehicle
 from sfkd_jax.policy import CERTIFICATE, TrainedModel, restore
 from sfkd_jax.ranges import imported
 from sfkd_jax.settings import replace

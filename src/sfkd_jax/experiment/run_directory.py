@@ -9,8 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sfkd_jax import evaluation, store
-from sfkd_jax.evaluation.metrics import Row
+from sfkd_jax import store
+from sfkd_jax.driving import simulation
+from sfkd_jax.driving.simulation.metrics import Row
 
 IDENTITY = ("vehicle", "environment", "dataset", "model", "training", "seed")
 """Settings that determine the weights of a run; of the environment, its box."""
@@ -62,7 +63,7 @@ def read_results(run_dir: Path) -> list[Row]:
     if not results.exists():
         return []
     with store.as_artefact_error(results):
-        return evaluation.merge([], store.read_json(results, keys=("rows",))["rows"])
+        return simulation.merge([], store.read_json(results, keys=("rows",))["rows"])
 
 
 def keep_episodes(directory: Path, name: str, row: Row, arrays: Any) -> Row:
@@ -74,7 +75,7 @@ def keep_episodes(directory: Path, name: str, row: Row, arrays: Any) -> Row:
         row: whose episodes they are.
         arrays: by name.
     """
-    config = evaluation.identity(row)
+    config = simulation.identity(row)
     store.write_arrays(directory / name, arrays, kind=EPISODES, config=config)
     return {**row, "arrays": name}
 
@@ -102,11 +103,11 @@ def write_results(
     with store.locked(run_dir, wait=True):
         # Arrays first: a row that is listed then has its episodes.
         for row, arrays in results:
-            digest = store.sha256(evaluation.identity(row))[:16]
+            digest = store.sha256(simulation.identity(row))[:16]
             name = f"episodes/{digest}.safetensors"
             rows.append(keep_episodes(run_dir, name, row, arrays))
         document = {
-            "rows": evaluation.merge(read_results(run_dir), rows),
+            "rows": simulation.merge(read_results(run_dir), rows),
             "config": config,
             "versions": store.versions(),
             "seconds": seconds,

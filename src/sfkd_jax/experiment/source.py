@@ -12,8 +12,9 @@ import jax
 
 from sfkd_jax import assembly, store
 from sfkd_jax.assembly import VehicleSettings
-from sfkd_jax.control import PathLaw
 from sfkd_jax.data import Dataset
+from sfkd_jax.driving.path_following import PathLaw
+from sfkd_jax.driving.plants import Vehicle, check_step
 from sfkd_jax.experiment import data, dataset_files, identified, laws
 from sfkd_jax.experiment.options import (
     AlongPathSettings,
@@ -21,7 +22,6 @@ from sfkd_jax.experiment.options import (
     EnvironmentSettings,
     LogSettings,
 )
-from sfkd_jax.plants import Vehicle, check_step
 from sfkd_jax.settings import replace
 from sfkd_jax.types import Trajectory
 

@@ -12,8 +12,6 @@ import jax.numpy as jnp
 from sfkd_jax import assembly, policy, store
 from sfkd_jax.certificate import (
     AxisNames,
-    Corridor,
-    DrivingCertificate,
     Proof,
     Provenance,
     Refusal,
@@ -21,9 +19,10 @@ from sfkd_jax.certificate import (
     write,
 )
 from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
-from sfkd_jax.certification.corridor import closed_loop, measure_corridor
-from sfkd_jax.control import PathLaw
 from sfkd_jax.data import check_shares
+from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
+from sfkd_jax.driving.corridor import closed_loop, measure_corridor
+from sfkd_jax.driving.path_following import PathLaw
 from sfkd_jax.experiment.options import (
     CertificationSettings,
     EnvironmentSettings,

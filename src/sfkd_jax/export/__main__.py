@@ -7,7 +7,7 @@ from typing import Any
 from sfkd_jax import policy, store
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.run import Run
-from sfkd_jax.export import write_controller
+from sfkd_jax.export._controller import write_controller
 from sfkd_jax.settings import arguments
 
 

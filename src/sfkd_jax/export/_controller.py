@@ -18,8 +18,8 @@ from jaxtyping import Array
 
 from sfkd_jax import assembly, policy, store
 from sfkd_jax.certificate import write
-from sfkd_jax.lanes import Lane, Obstacles
-from sfkd_jax.paths import Path as Road
+from sfkd_jax.driving.lanes import Lane, Obstacles
+from sfkd_jax.driving.paths import Path as Road
 from sfkd_jax.policy import Policy
 from sfkd_jax.ranges import MayBeEmpty, Names, Positive
 from sfkd_jax.types import Controller

@@ -1,10 +1,9 @@
-"""Models of the vehicle; those that are learned are listed in `FACTORIES`."""
+"""Models; those that are learned are listed in `FACTORIES`."""
 
 from sfkd_jax.models._continuous import neural_ode as neural_ode
 from sfkd_jax.models._control_synth import control_synth as control_synth
 from sfkd_jax.models._icode import icode as icode
 from sfkd_jax.models._icode import icode_mppi as icode_mppi
-from sfkd_jax.models._koopman import koopman as koopman
 from sfkd_jax.models._one_step import one_step as one_step
 from sfkd_jax.models._own import own as own
 from sfkd_jax.models._state_model import flat as flat
@@ -20,12 +19,10 @@ FACTORIES = {
     "icode": icode,
     "icode_mppi": icode_mppi,
     "control_synth": control_synth,
-    "koopman_mpc": koopman,
 }
 """Learned models: name -> factory(space, *, settings).
 
 `space` holds measured scales, which fix all sizes. Several models have these settings:
 `dt` is the sampling period and the solver's step [s]. `environment` is whether e is
-used; if not, e is 0. `frame` is a `types.Frame`, the
-coordinates of states.
+used; if not, e is 0. `frame` is a `types.Frame`, the coordinates of states.
 """

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from sfkd_jax import assembly, store
-from sfkd_jax.certificate import DrivingCertificate, describe_signature
-from sfkd_jax.control import in_the_world
+from sfkd_jax.certificate import describe_signature
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.path_following import in_the_world
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
 from sfkd_jax.policy._certificate import RECORDED as RECORDED
@@ -83,7 +84,7 @@ class Policy(TrainedModel):
                 `partial`), the observation, e and the reference, and returns a control
                 of the vehicle. Its `info` is the part `planner` of the result.
             along_path: whether it takes ξ and a preview instead of observation and
-                reference, see `control.along_reference`.
+                reference, see `path_following.along_reference`.
 
         Raises:
             ValueError: the policy has no certified corridor.
@@ -160,7 +161,7 @@ def load(
             coordinates that estimates the environment and ignores the one it is given;
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
-            errors of its inputs while driving, see `control.Adaptation`.
+            errors of its inputs while driving, see `path_following.Adaptation`.
         signed_by: public ed25519 key of who must have signed the certificate, as 64
             hexadecimal digits or the path of a PEM file. Only a signature vouches for
             measured numbers. None to accept an unsigned certificate, too.

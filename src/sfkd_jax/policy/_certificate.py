@@ -6,7 +6,8 @@ from pathlib import Path
 
 from sfkd_jax import certificate as certificates
 from sfkd_jax import store
-from sfkd_jax.certificate import DrivingCertificate, Refusal
+from sfkd_jax.certificate import Refusal
+from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.policy._trained import TrainedModel, policy_file
 
 CERTIFICATE = "certificate.json"
@@ -34,7 +35,8 @@ def read_certificate(
         ArtefactError: it is damaged, does not follow from its witnesses, or is not
             signed by this key.
     """
-    from sfkd_jax import certification  # loaded only if there is something to verify
+    from sfkd_jax import certification
+    from sfkd_jax.driving import corridor  # loaded only if there is something to verify
 
     files = [policy_file(path).with_name(name) for name in (RECORDED, CERTIFICATE)]
     file = next((file for file in files if file.exists()), None)
@@ -53,7 +55,7 @@ def read_certificate(
         _require_signature(file, certificate, certificate.signature.public_key)
     try:
         with store.as_artefact_error(file):
-            certification.verify_driving(certificate, trained)
+            corridor.verify_driving(certificate, trained)
     except certification.CertificateStale as reason:
         if signed_by is not None:
             raise store.failure(file, reason) from None

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import assembly
-from sfkd_jax.certificate import Conditions, DrivingCertificate
-from sfkd_jax.plants import axes
+from sfkd_jax.driving.certificate import Conditions, DrivingCertificate
+from sfkd_jax.driving.plants import axes
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sfkd_jax import store
-from sfkd_jax.certificate import DrivingCertificate, read
+from sfkd_jax.certificate import read
+from sfkd_jax.driving.certificate import DrivingCertificate
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """A folder for each shipped policy, as `train` wrote it."""

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from sfkd_jax import assembly, store
-from sfkd_jax.control import PathLaw, law_from_arrays
-from sfkd_jax.plants import Vehicle
+from sfkd_jax.driving.path_following import PathLaw, law_from_arrays
+from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.policy._shipped import POLICY_FILE, SHIPPED, shipped_names
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Model, Params

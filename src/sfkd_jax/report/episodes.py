@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sfkd_jax import store
-from sfkd_jax.evaluation import SHARED
-from sfkd_jax.evaluation.metrics import Row, switches
+from sfkd_jax.driving.simulation import SHARED
+from sfkd_jax.driving.simulation.metrics import Row, switches
 from sfkd_jax.report.style import family, rank
 from sfkd_jax.report.tables import name_of
 

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from sfkd_jax.driving.simulation.metrics import LANE_HALF_WIDTH, Row
 from sfkd_jax.evaluation.formats import dig, is_number
-from sfkd_jax.evaluation.metrics import LANE_HALF_WIDTH, Row
 from sfkd_jax.report import style
 from sfkd_jax.report.episodes import Episodes
 from sfkd_jax.report.tables import name_of

@@ -13,7 +13,7 @@ from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from PIL import Image
 
-from sfkd_jax.evaluation import Episode
+from sfkd_jax.driving.simulation import Episode
 from sfkd_jax.report import style
 from sfkd_jax.report.frames import (
     EVERY,

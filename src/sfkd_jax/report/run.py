@@ -12,10 +12,11 @@ import pandas as pd
 from sfkd_jax import store
 from sfkd_jax.assembly import build_vehicle
 from sfkd_jax.certificate import signature_of
-from sfkd_jax.evaluation import SHARED, formats
+from sfkd_jax.driving.plants import axes
+from sfkd_jax.driving.simulation import SHARED
+from sfkd_jax.driving.simulation.metrics import Row
+from sfkd_jax.evaluation import formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, plain, short
-from sfkd_jax.evaluation.metrics import Row
-from sfkd_jax.plants import axes
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import film_of

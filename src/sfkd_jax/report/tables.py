@@ -7,9 +7,10 @@ from typing import Any
 
 import pandas as pd
 
-from sfkd_jax.evaluation import formats, identity
+from sfkd_jax.driving.simulation import identity
+from sfkd_jax.driving.simulation.metrics import BY_NAME, METRICS, Metric, Row
+from sfkd_jax.evaluation import formats
 from sfkd_jax.evaluation.formats import DASH, dig, is_number, is_pair, millimetres
-from sfkd_jax.evaluation.metrics import BY_NAME, METRICS, Metric, Row
 from sfkd_jax.report.style import family, label, rank, scenario_label
 
 NO_MODEL = ("nominal", "oracle", "law")

@@ -9,12 +9,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.control._factory import factory
 from sfkd_jax.control._finite import replace_nonfinite
-from sfkd_jax.control.planners._planner import (
-    Evaluate,
-    SearchResult,
-    Tuning,
-    iterate,
-)
+from sfkd_jax.control.planners._planner import Evaluate, SearchResult, Tuning, iterate
 from sfkd_jax.control.planners._rollouts import Plan
 from sfkd_jax.control.planners._sampling import SamplingPlanner
 from sfkd_jax.types import Key

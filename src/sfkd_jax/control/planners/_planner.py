@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, UInt32
 
 from sfkd_jax.control._factory import Stateful
 from sfkd_jax.control._finite import all_finite
+from sfkd_jax.control._task import PlanningStart, Task
 from sfkd_jax.control.planners._rollouts import Evaluated, Plan, Plans, Rollouts
-from sfkd_jax.control.tasks._task import PlanningStart, Task
 from sfkd_jax.info import Claim, ControllerInfo, PlanInfo, Reason, first
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
 from sfkd_jax.types import Control, Key, Params, Scalar

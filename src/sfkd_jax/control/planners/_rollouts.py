@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control._finite import replace_nonfinite
-from sfkd_jax.control.tasks._task import RolloutSetup, Sample, StepIndex, Task
+from sfkd_jax.control._task import RolloutSetup, Sample, StepIndex, Task
 from sfkd_jax.rollout import in_batches
 
 Plan: TypeAlias = Float[Array, "horizon control"]

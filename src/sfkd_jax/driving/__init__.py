@@ -1,0 +1,1 @@
+"""Driving: vehicles along paths, built on the ground floor."""

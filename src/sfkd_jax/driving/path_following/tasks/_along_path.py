@@ -1,0 +1,301 @@
+"""Driving along a path: the projection of each step, and the task of following a law.
+
+A controller along a path is a `Controller` whose observation is ξ and whose reference
+is a `Preview`. `along_reference` turns it into one that sees poses in the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sfkd_jax.control import (
+    PlanningStart,
+    RolloutSetup,
+    Sample,
+    Stateful,
+    StepIndex,
+    StepResult,
+    Task,
+    all_finite,
+    factory,
+)
+from sfkd_jax.driving.path_coordinates import (
+    HEADING,
+    LATERAL,
+    PATH_FRAME,
+    PATH_SPEED,
+    PathState,
+    beside,
+    curvature_ahead,
+    followable,
+    path_coordinates,
+)
+from sfkd_jax.driving.path_following.laws._feedback import PathErrors
+from sfkd_jax.driving.path_following.laws._path_law import PathLaw
+from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
+from sfkd_jax.driving.path_following.tasks._path_tracking import LawTask, check_path
+from sfkd_jax.geometry import between, entrywise, without_pose
+from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import (
+    BODY,
+    POSE,
+    Control,
+    Controller,
+    Environment,
+    Key,
+    Params,
+    Reference,
+    Scalar,
+    State,
+)
+
+
+class Preview(NamedTuple):
+    """The road ahead, as controllers along a path see it.
+
+    Attributes:
+        road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
+            finite.
+        along: distance along the path from the first point of the reference to the
+            observed position [m]; behind a `Gate`, to the last position that was
+            believed.
+        observation: in the world, as it came.
+        reference: in the world, as it came.
+        repeated: whether the observation is bit for bit the last one, like that of a
+            sensor that froze.
+        measured: which entries of ξ are measured; behind a `Gate` the others are
+            predicted.
+        on_time: whether the last call was one period ago.
+        reason: CERTIFIED if nothing in the inputs speaks against a claim, else the
+            first `Reason` that does, see `Gate`.
+    """
+
+    road: Float[Array, "horizon 2"]
+    along: Scalar
+    observation: State
+    reference: Reference
+    repeated: Bool[Array, ""]
+    measured: Bool[Array, " coordinate"]
+    on_time: Bool[Array, ""]
+    reason: Int[Array, ""]
+
+
+class AlongReferenceState(NamedTuple):
+    """State of the wrapped controller, and the last observation in the world."""
+
+    inner: Any
+    observation: State
+
+
+@dataclass(frozen=True, eq=False)
+class AlongReference(Stateful):
+    """A controller in the world from one along a path.
+
+    This is the only place where a state is projected onto the path, once per control
+    step. Predicted states are mapped back beside the points of the reference.
+
+    `info` gains `path`, see `PathInfo`; its ξ and inputs are NaN if the observation or
+    the reference is not finite.
+
+    Attributes:
+        inner: its `act` takes ξ and a `Preview` in place of observation and reference.
+        coordinates: size of ξ.
+    """
+
+    inner: Controller
+    _: KW_ONLY
+    coordinates: int
+
+    def init(self, key: Key) -> AlongReferenceState:
+        """Return the state before the first control step."""
+        # NaN equals nothing, so the first observation is never a repetition.
+        unknown = jnp.full(self.coordinates + 1, jnp.nan, dtype=float)
+        return AlongReferenceState(self.inner.init(key), unknown)
+
+    def act(
+        self,
+        params: Params,
+        state: AlongReferenceState,
+        observation: State,
+        env: Environment,
+        reference: Reference,
+    ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
+        """Take one control step."""
+        precise = check_path(observation, env, reference, reference.shape[0])
+        points, is_followable = followable(reference)
+        curvature = curvature_ahead(points)
+        xi = path_coordinates(observation, points[0], curvature[0])
+        road = jnp.stack([curvature, points[:, 3]], axis=1)
+        # κ can be finite where a position is not, because such points count as one.
+        # A reference that cannot be trusted as a whole is NaN as a whole.
+        readable = all_finite(points)
+        road = jnp.where(readable, road, jnp.nan)
+        xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
+        repeated = jnp.all(observation == state.observation)
+        preview = Preview(
+            road=road,
+            along=between(points[0, POSE], observation[POSE])[0],
+            observation=observation,
+            reference=reference,
+            repeated=repeated,
+            measured=jnp.isfinite(xi),
+            on_time=jnp.asarray(True),
+            reason=first(
+                Reason.CERTIFIED,
+                (~(readable & is_followable), Reason.BAD_REFERENCE),
+                (~precise & all_finite(observation), Reason.IMPRECISE),
+            ),
+        )
+        control, inner, info = self.inner.act(params, state.inner, xi, env, preview)
+        info = reported(info)
+        planned = info.plan.states
+        if planned is not None:
+            states = jax.vmap(beside)(planned, points)
+        else:
+            states = reported(info.planner).plan.states
+        info = info._replace(plan=info.plan._replace(states=states))
+        measured = preview.measured if info.gate is None else info.gate.measured
+        seen = jnp.where(measured, xi, jnp.nan)
+        info = info._replace(
+            claim=info.claim.under(preview.reason),
+            path=PathInfo(xi=seen, inputs=road[0], planned=planned),
+        )
+        return control, AlongReferenceState(inner, observation), info
+
+
+along_reference = factory(AlongReference, AlongReference.controller)
+"""(controller along a path, coordinates=size of ξ) -> `Controller` in the world."""
+
+
+class AlongTarget(NamedTuple):
+    """What all samples share of one step.
+
+    Attributes:
+        road: κ [1/m] and v_ref [m/s].
+        turn: of the law on this road.
+        fiber: of the model on this road; None if it is that of all steps.
+    """
+
+    road: Float[Array, "*horizon 2"]
+    turn: SteadyTurn
+    fiber: Any
+
+
+@dataclass(frozen=True, eq=False)
+class FollowingLaw(LawTask):
+    """The task of following a path with a model of the closed loop.
+
+        ξ_{k+1} = F(ξ_k, (ν_k, κ_k, v_k); e),   u_k = limit(law(ξ_k; κ_k, v_k, e) + ν_k)
+        J = Σ_k ℓ(ξ_{k+1}, u_k) + w_T ℓ(ξ_T, u_{T-1})
+
+    A plan is the perturbation ν of the law. A planner of this task is a controller
+    along a path, see `along_reference`; its predicted states are ξ. |ν| stays within
+    `law.perturbation`, as it did in the training data.
+
+    Attributes:
+        law: around which the model was learned. The other attributes are those of
+            `LawTask`, with a model in path coordinates.
+    """
+
+    law: PathLaw
+
+    def __post_init__(self) -> None:
+        if self.model.frame is not PATH_FRAME:
+            raise ValueError(
+                "controller.sampling=law needs a model in path coordinates: "
+                "model.frame=path"
+            )
+        super().__post_init__()
+
+    def prepare(
+        self,
+        params: Params,
+        xi: PathState,
+        env: Environment,
+        preview: Preview,
+        previous: PlanningStart,
+    ) -> RolloutSetup:
+        """Return what is evaluated once per control step: fibre, start and targets."""
+        fiber = self.model.fiber(fold(self.model, params), env)
+        turns = jax.vmap(self.law.turn, in_axes=(0, 0, None))(
+            preview.road[:, 0], preview.road[:, 1], env
+        )
+        first_turn = jax.tree.map(lambda leaf: leaf[0], turns)
+        low, high = self.box()
+        law_control = jnp.clip(first_turn.feedback(xi), low, high)
+        # Before the first step no control was applied: slew limits count from the law.
+        before = jnp.where(previous.known, previous.control, law_control)
+        latent = self.model.encode(fiber, without_pose(xi))
+        start = Sample(latent, xi, before)
+        fibers = None
+        if self.model.on_reference is not None:
+            fibers = jax.vmap(partial(self.model.on_reference, fiber))(preview.road)
+        return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
+
+    def step(
+        self,
+        weights: Any,
+        fiber: Any,
+        before: Sample,
+        nu: Control,
+        target: AlongTarget,
+        at: StepIndex,
+    ) -> StepResult:
+        """Return one step of one rollout: law, perturbation, limits, model."""
+        law_control = target.turn.feedback(before.state)
+        largest = jnp.asarray(self.law.perturbation)
+        nu = entrywise(jnp.clip, nu, -largest, largest)
+        control = self.limit(law_control + nu, before.control)
+        # The model was learned on the perturbations that really acted.
+        effective = control - law_control
+        inputs = jnp.concatenate([effective, target.road])
+        road_fiber = fiber if target.fiber is None else target.fiber
+        latent = self.model.step(road_fiber, before.latent, inputs)
+        xi = self.model.decode(fiber, latent)[BODY]
+        return StepResult(
+            sample=Sample(latent, xi, control),
+            control=control,
+            perturbation=effective,
+            state=xi,
+        )
+
+    def errors(
+        self, before: Sample, after: Sample, target: AlongTarget
+    ) -> tuple[PathErrors, PathErrors, Scalar]:
+        """Return the errors before and after a step, and the speed of the reference."""
+        speed = target.road[1]
+
+        def errors_of(xi: PathState) -> PathErrors:
+            return PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
+
+        return errors_of(before.state), errors_of(after.state), speed
+
+
+def check_preview(xi: Any, env: Any, preview: Any, horizon: int) -> None:
+    """Raise a ValueError if there is no preview of this horizon."""
+    if not isinstance(preview, Preview):
+        raise ValueError(
+            "a planner along a path takes ξ and a `Preview`; "
+            "`along_reference` makes them of poses in the world"
+        )
+    if preview.road.shape != (horizon, 2):
+        raise ValueError(
+            f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "
+            f"got {preview.road.shape[0]} steps"
+        )
+
+
+def _task(settings: FollowingLaw) -> Task:
+    """Return the task of following a law, which checks previews."""
+    return settings.task(check_preview)
+
+
+following_law = factory(FollowingLaw, _task)
+"""(model, cost, law, settings of `FollowingLaw`) -> `Task`."""

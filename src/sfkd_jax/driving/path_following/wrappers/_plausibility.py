@@ -1,0 +1,260 @@
+"""What the gate believes of a measurement along a path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sfkd_jax.control import all_finite
+from sfkd_jax.driving.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
+from sfkd_jax.driving.path_following.tasks._along_path import Preview
+from sfkd_jax.driving.path_following.wrappers._conditions import Box
+from sfkd_jax.driving.path_following.wrappers._innovations import InnovationState
+from sfkd_jax.geometry import put, wrap_angle
+from sfkd_jax.types import Environment, Scalar
+
+MOVING = 0.3
+"""Speed [m/s] above which a repeated observation is that of a sensor that froze."""
+PATIENCE_AHEAD = 6.0
+"""Longest time on observations from another place of the path, or without them [s]."""
+LATEST = 1.2
+"""Largest delay of an observation that is recognised [s]."""
+AS_LATE = 0.5
+"""Share of the limits by which a late observation may differ from the estimate of its
+time. A wrong position is behind on the path as well, and rarely that close.
+"""
+
+
+class GateState(NamedTuple):
+    """What the gate carries from one control step to the next.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        expected: ξ predicted for this step; NaN before the first measurement.
+        modelled: whether the model predicted it, inside the conditions.
+        along: distance along the path of the last measured position, see `Preview`.
+        missing: number of steps since each coordinate was last used.
+        skew: what a wrong pose adds to the relative yaw [rad]; 0 for a right one.
+        doubt: number of steps until the certificate may be claimed again, after a
+            measurement was believed that nothing explains.
+        env: the last finite environment.
+        road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
+            0 before the first one.
+        test: state of the test of the innovations, or None.
+        past: estimates of ξ at the last steps, newest first, and κ there [1/m].
+    """
+
+    inner: Any
+    expected: PathState
+    modelled: Bool[Array, ""]
+    along: Scalar
+    missing: Int[Array, " coordinate"]
+    skew: Scalar
+    doubt: Int[Array, ""]
+    env: Environment
+    road: Float[Array, "preview 2"]
+    test: InnovationState | None
+    past: Float[Array, "step coordinate+1"]
+
+
+class Believed(NamedTuple):
+    """What is believed of a measurement.
+
+    Attributes:
+        xi: ξ, measured where that is believed, and elsewhere predicted.
+        measured: which entries of ξ are measured.
+        lost: whether there has been nothing to believe for too long.
+        state: of the gate, with what follows from the measurement.
+    """
+
+    xi: PathState
+    measured: Bool[Array, " coordinate"]
+    lost: Bool[Array, ""]
+    state: GateState
+
+
+class Earlier(NamedTuple):
+    """A measurement that lies behind on the path, as one of an earlier step.
+
+    Attributes:
+        difference: from the estimate of that step; NaN if the vehicle was not there.
+        difference_now: what the estimate of now therefore differs by.
+        past: the estimates since then, corrected by the measurement.
+    """
+
+    difference: PathState
+    difference_now: PathState
+    past: Float[Array, "step coordinate+1"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plausibility:
+    """The rules by which a measurement is right, late, or wrong in position or yaw.
+
+    Attributes:
+        dt: sampling period [s].
+        box: of ξ, in which the model predicts; None without one.
+        patience: longest time on the nominal model [s].
+        trial: time without a claim after an implausible measurement was believed [s].
+        share: of the half widths of the box of ξ that one step may be off.
+        gain: of the estimate that is kept of each step.
+        growth: of the limits per step without a measurement.
+    """
+
+    dt: float
+    box: Box | None
+    patience: float
+    trial: float
+    share: float
+    gain: float
+    growth: float
+
+    def judge(
+        self,
+        state: GateState,
+        observed: PathState,
+        preview: Preview,
+        periods: Scalar,
+    ) -> Believed:
+        """Return what is believed of a measurement.
+
+        Args:
+            state: of the gate after the last step.
+            observed: observed ξ.
+            preview: of the road, with the place of the observation along the path.
+            periods: sampling periods since the last call.
+        """
+        expected = state.expected
+        compared = all_finite(expected)
+        innovation = difference(observed, expected)
+        limit = self._limit(state, periods, preview.on_time)
+        grown = limit * (1.0 + self.growth * state.missing)
+        plausible = jnp.abs(innovation) <= grown
+        moving = jnp.abs(expected[PATH_SPEED]) > MOVING
+        seen = jnp.isfinite(observed) & ~(preview.repeated & moving)
+
+        # The path goes on under the vehicle: an observation that is suddenly ahead or
+        # behind is of another time or place, in all of its entries.
+        gap = preview.along - state.along
+        shifted = (jnp.abs(gap) > self._reach(state, periods)) & moving
+        earlier = self._earlier(state, observed, preview.road[0, 0], gap)
+        late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
+        late &= preview.on_time & shifted
+        # Not for ever: the reference may have moved, and the car has stopped by then.
+        longest = round(PATIENCE_AHEAD / self.dt)
+        usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
+
+        # What stays implausible for so long is true: the prediction was wrong.
+        longest = jnp.where(late, longest, round(self.patience / self.dt))
+        overdue = state.missing >= longest
+        # A yaw alone is never believed for that reason: the position would show it.
+        overdue = put(overdue, HEADING, overdue[HEADING] & ~plausible[LATERAL])
+        measured = usable & (plausible | overdue | ~compared)
+        # Either this measurement or all that was believed before is wrong, and nothing
+        # says which.
+        forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
+        missing = jnp.where(measured, 0, state.missing + 1)
+        xi = jnp.where(measured, observed, expected)
+        xi = jnp.where(late, expected + earlier.difference_now, xi)
+
+        skew = self._skew(state.skew, innovation[HEADING], grown[HEADING])
+        skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
+        heading = jnp.where(skewed, observed[HEADING] - skew, xi[HEADING])
+        xi = put(xi, HEADING, heading)
+
+        # A believed outlier starts anew; noise is averaged.
+        estimate = expected + self.gain * difference(xi, expected)
+        estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
+        here = jnp.append(estimate, preview.road[0, 0])
+        past = jnp.where(late, earlier.past, state.past)
+        after = state._replace(
+            along=jnp.where(jnp.all(measured), preview.along, state.along),
+            missing=missing,
+            skew=jnp.where(skewed, skew, 0.0),
+            doubt=jnp.where(forced, round(self.trial / self.dt), state.doubt),
+            past=jnp.concatenate([here[None], past[:-1]]),
+        )
+        lost = jnp.any((missing > longest) & ~usable)
+        return Believed(xi, measured, lost, after)
+
+    def _skew(self, before: Scalar, innovation: Scalar, limit: Scalar) -> Scalar:
+        """Return by which angle a wrong yaw is wrong [rad].
+
+        A yaw that is wrong stays wrong by the same angle, and so does a yaw relative to
+        the wrong place of a bend. Its changes are therefore still measured.
+        """
+        stays = jnp.abs(wrap_angle(innovation - before)) <= limit
+        return jnp.where((before != 0.0) & stays, before, innovation)
+
+    def _earlier(
+        self, state: GateState, xi: PathState, curvature: Scalar, gap: Scalar
+    ) -> Earlier:
+        """Return the measurement as one of the earlier step at its place.
+
+        Args:
+            state: of the gate after the last step.
+            xi: observed ξ.
+            curvature: of the path here [1/m].
+            gap: from the last measured position to the observed one, along the path
+                [m].
+        """
+        past = state.past[:, :-1]
+        curvatures = state.past[:, -1]
+        steps = self.dt * past[:, PATH_SPEED]
+        behind = jnp.cumsum(steps)
+        miss = jnp.nan_to_num(jnp.abs(behind + gap), nan=jnp.inf)
+        which = jnp.argmin(miss)
+        # ξ is relative to the circle of the road here, which was another one there.
+        turned = jnp.cumsum((curvatures - curvature) * steps)
+        then = past[which]
+        then = put(then, HEADING, then[HEADING] - turned[which])
+        then = put(then, LATERAL, then[LATERAL] + jnp.cumsum(turned * steps)[which])
+        off = difference(xi, then)
+        near = miss[which] <= 0.6 * jnp.abs(steps[which]) + 0.1
+        off = jnp.where(near, off, jnp.nan)
+        # Rates of the body decay. An error of the heading stays, and moves the vehicle
+        # sideways on its way from there.
+        lasting = jnp.where(np.arange(len(off)) > PATH_SPEED, 0.0, off)
+
+        def after(distance: Scalar) -> PathState:
+            return put(lasting, LATERAL, lasting[LATERAL] + distance * off[HEADING])
+
+        later = jnp.arange(len(behind)) <= which
+        change = self.gain * jax.vmap(after)(behind[which] - behind)
+        corrected = past + jnp.where(later[:, None], change, 0.0)
+        return Earlier(
+            difference=off,
+            difference_now=after(behind[which]),
+            past=jnp.concatenate([corrected, curvatures[:, None]], axis=1),
+        )
+
+    def _reach(self, state: GateState, periods: Scalar) -> Scalar:
+        """Return how far the vehicle gets in a step, and somewhat more [m]."""
+        speed = jnp.abs(state.expected[PATH_SPEED])
+        return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
+
+    def _limit(
+        self, state: GateState, periods: Scalar, on_time: Bool[Array, ""]
+    ) -> Float[Array, " coordinate"]:
+        """Return the largest difference that one step explains, entry by entry."""
+        # What a vehicle can reach in a step without knowing its model: sideways what
+        # it drives, and more than any tyre turns, accelerates and slides.
+        rest = [jnp.inf] * (state.expected.shape[0] - 3)
+        wide = jnp.asarray([0.0, 0.35, 1.5, *rest]) * jnp.maximum(periods, 1.0)
+        wide = put(wide, LATERAL, self._reach(state, periods))
+        if self.box is None:
+            return wide
+        low, high = map(jnp.asarray, self.box)
+        tight = jnp.minimum(0.5 * self.share * (high - low), wide)
+        return jnp.where(state.modelled & on_time, tight, wide)
+
+
+def difference(xi: PathState, other: PathState) -> PathState:
+    """Return ξ − ξ', with the heading wrapped."""
+    gap = xi - other
+    return put(gap, HEADING, wrap_angle(gap[HEADING]))

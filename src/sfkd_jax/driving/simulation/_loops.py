@@ -1,0 +1,213 @@
+"""Episodes in closed loop, with imperfect sensors and side forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sfkd_jax.driving.path_coordinates import LATERAL, curvature_ahead, path_coordinates
+from sfkd_jax.driving.paths import project, reference_window
+from sfkd_jax.driving.plants import Vehicle, equivalent_wind
+from sfkd_jax.driving.scenarios import (
+    Scenario,
+    car_clearance,
+    in_view,
+    random_side_forces,
+)
+from sfkd_jax.driving.simulation.metrics import SIGNALS, Signal
+from sfkd_jax.info import reported
+from sfkd_jax.ranges import Real
+from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+
+FORCE_STREAM = 2
+"""Number that is folded into an episode's key for the random side forces. The streams 0
+and 1 are those of the planner and of the state sensors, which `split` makes.
+"""
+SENSOR_STREAM = 3
+"""The same for the errors of the observed environment."""
+LEAST_FRICTION = 0.05
+"""Smallest friction that a faulty sensor shows [-]."""
+
+
+class Episode(NamedTuple):
+    """One closed-loop episode.
+
+    Attributes:
+        states: x_0 … x_T, (time + 1, state).
+        controls: applied controls, (time, control).
+        lateral: signed distance of x_1 … x_T from the path [m], (time,). On a course
+            with obstacles it is from the reference that the controller follows.
+        progress: arc length that x_1 … x_T have reached [m], (time,).
+        signals: values that metrics or the caller recorded at every step, by name,
+            each (time, …).
+    """
+
+    states: Float[Array, "time_plus_1 state"]
+    controls: Float[Array, "time control"]
+    lateral: Float[Array, " time"]
+    progress: Float[Array, " time"]
+    signals: dict[str, Any]
+
+
+def simulate(
+    plant: Step,
+    controller: Controller,
+    params: Params,
+    scenario: Scenario,
+    key: Key,
+    *,
+    dt: float,
+    horizon: int,
+    observation_noise: Sequence[float | Scalar] = (),
+    size: tuple[float, float] | None = None,
+    record: Mapping[str, Signal] | None = None,
+) -> Episode:
+    """Simulate one episode.
+
+    The plant is in `scenario.envs`, the controller observes `scenario.observed_envs`.
+    Two systems with the same scenario and key follow the same path in the same
+    environment, with the same sensor noise and sampling keys.
+
+    On a course with obstacles the controller receives lane and obstacles in view in
+    place of a reference. Two signals then say how near the car comes: `gap` is its true
+    distance from the nearest obstacle [m], and `clearance` is the distance that the
+    controller claims. Both are NaN where there is no such value.
+
+    Args:
+        plant: the true step.
+        controller: of the car.
+        params: of the controller's model.
+        scenario: path, speed, environment and start.
+        key: consumed.
+        dt: sampling period [s].
+        horizon: length of the reference window.
+        observation_noise: standard deviation per state. States beyond its length are
+            observed without noise; entries beyond the states are not used.
+        size: length and width of the car [m], which a course needs.
+        record: more signals of every step, by name, besides those of the metrics.
+
+    Raises:
+        ValueError: a course without the size of the car.
+    """
+    if scenario.course is not None and size is None:
+        raise ValueError("obstacles on the road need the size of the car: vehicle.size")
+    # Sensors have a key of their own, so that two systems meet the same noise.
+    planner_key, noise_key = jax.random.split(key)
+    recorded = SIGNALS | dict(record or {})
+    levels = jnp.asarray(observation_noise, dtype=float)[: len(scenario.initial_state)]
+    spread = jnp.zeros_like(scenario.initial_state).at[: len(levels)].set(levels)
+    noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
+
+    def step(
+        carry: tuple[State, Scalar, Any], inputs: tuple[Array, Array, Key]
+    ) -> tuple[Any, Any]:
+        state, progress, memory = carry
+        env, observed_env, sensor_key = inputs
+        # Noise reaches the controller alone, and neither plant nor scores.
+        observation = state + spread * jax.random.normal(sensor_key, state.shape)
+        if scenario.course is not None:
+            ahead: Any = scenario.course.lane, in_view(scenario.course, progress)
+        else:
+            ahead = reference_window(
+                scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
+            )
+        control, memory, info = controller.act(
+            params, memory, observation, observed_env, ahead
+        )
+        info = reported(info)
+        state = plant(state, control, env)
+        # The guess moves on at the reference speed. Where the path crosses itself, the
+        # foot point therefore stays on the right branch.
+        progress, lateral = project(
+            scenario.path, state[:2], progress + scenario.speed * dt
+        )
+        if scenario.course is not None:
+            assert size is not None
+            info = info._replace(gap=car_clearance(ahead[1], state, size=size))
+            if info.lane is not None:
+                # The first point of the reference is where the car should be now.
+                reference = info.lane.reference
+                curvature = curvature_ahead(reference)[0]
+                lateral = path_coordinates(state, reference[0], curvature)[LATERAL]
+        signals = {name: signal(info) for name, signal in recorded.items()}
+        return (state, progress, memory), (state, control, lateral, progress, signals)
+
+    start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
+    inputs = (scenario.envs, scenario.observed_envs, noise_keys)
+    _, (states, *rest) = jax.lax.scan(step, start, inputs)
+    return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
+
+
+def observed_environment(
+    envs: Float[Array, "time environment"],
+    key: Key,
+    *,
+    dt: float,
+    delay_s: float = 0.0,
+    noise: tuple[float, float] = (0.0, 0.0),
+    bias: tuple[Real, Real] = (0.0, 0.0),
+) -> Float[Array, "time environment"]:
+    """Return ê_k = e_{k−d} + b + n_k: delayed, biased, with white noise.
+
+    Until the first delayed value arrives, the first value of the episode is observed.
+    Observed friction is at least 0.05, unless the sensor is perfect.
+
+    Args:
+        envs: the true environment.
+        key: of the episode. It is not consumed, so that its other streams stay as they
+            are.
+        dt: sampling period [s].
+        delay_s: d in seconds.
+        noise: standard deviations of friction [-] and wind [m/s].
+        bias: b of friction [-] and wind [m/s].
+    """
+    steps = round(delay_s / dt)
+    delayed = jnp.concatenate([jnp.tile(envs[:1], (steps, 1)), envs])[: envs.shape[0]]
+    white = jnp.asarray(noise) * jax.random.normal(
+        jax.random.fold_in(key, SENSOR_STREAM), envs.shape
+    )
+    observed = delayed + jnp.asarray(bias) + white
+    perfect = steps == 0 and not any(noise) and not any(bias)
+    # A perfect sensor passes e on bit for bit, even if the friction is below 0.05.
+    if perfect:
+        return envs
+    return observed.at[:, 0].max(LEAST_FRICTION)
+
+
+def disturbed_environment(
+    plant: Vehicle,
+    envs: Float[Array, "time environment"],
+    key: Key,
+    *,
+    largest: float | Float[Array, ""],
+) -> Float[Array, "time environment"]:
+    """Return the environment with random side forces, expressed as additional wind.
+
+    Args:
+        plant: whose wind force it is.
+        envs: the environment without these forces.
+        key: of the episode. It is not consumed, so that its other streams stay as they
+            are.
+        largest: F, forces lie in [-F, F] [N].
+
+    Raises:
+        ValueError: wind does not act on this plant.
+    """
+    if not plant.wind_force:
+        raise ValueError(
+            "evaluation.side_forces act through the wind, but vehicle.wind_force is 0"
+        )
+    force = random_side_forces(
+        jax.random.fold_in(key, FORCE_STREAM),
+        steps=envs.shape[0],
+        dt=plant.dt,
+        largest=largest,
+    )
+    # Plants have no other input from the side than wind.
+    wind = jax.vmap(partial(equivalent_wind, wind_force=plant.wind_force))
+    return envs.at[:, 1].set(wind(envs[:, 1], force))
