@@ -24,7 +24,7 @@ from helpers import (
 
 from sfkd_jax import models, paper
 from sfkd_jax.geometry import compose
-from sfkd_jax.models import RESIDUALS
+from sfkd_jax.models.sfkd import RESIDUALS
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import POSE, Structure, Trajectory
 
