@@ -2,6 +2,7 @@
 and only where unset.
 """
 
+import gc
 import os
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -10,7 +11,8 @@ from pathlib import Path
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache")
 )
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+# Both workers and every command compile hundreds of the same small programs.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # Threads of BLAS wait for each other over small matrices, minutes in one test.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -59,3 +61,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     decides when the run ends.
     """
     items.sort(key=lambda item: len(item.path.parts))
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector passes over what was imported, a million objects, every few
+    seconds: it need not look at these, and less often at the rest.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000)

@@ -229,7 +229,8 @@ def test_samples_and_vehicles_spread_over_four_devices_give_the_same_controls():
             np.testing.assert_allclose(u[0], v[0], atol=1e-5)
             assert "all-gather" not in v[1].as_text()
     """
-    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    four = "--xla_force_host_platform_device_count=4"
+    flags = {"XLA_FLAGS": f"{os.environ['XLA_FLAGS']} {four}"}
     command = [sys.executable, "-c", script]
     subprocess.run(command, check=True, cwd=EXAMPLES, env=os.environ | flags)
 

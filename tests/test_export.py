@@ -5,7 +5,6 @@ named in one line.
 import hashlib
 import importlib.util
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -19,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, optimised, space, straight
+from helpers import ENV_HIGH, ENV_LOW, SHARES, dataset, jit, space, straight
 
 import sfkd_jax
 from sfkd_jax import assembly, certification, policy, store
@@ -148,7 +147,7 @@ def plain(tree):
 @pytest.fixture(scope="module")
 def in_process(loaded):
     """Every leaf of every step of the policy's own controller, jitted here."""
-    act, steps = optimised(loaded.controller.act), []
+    act, steps = jit(loaded.controller.act), []
     state = loaded.controller.init(jax.random.key(7))
     observations, envs, reference = measurements()
     for observation, env in zip(observations, envs, strict=True):
@@ -190,7 +189,6 @@ def repeated(folder, observations, envs, **ahead):
         cwd=folder,
         capture_output=True,
         text=True,
-        env=os.environ | {"XLA_FLAGS": ""},
     )
     assert done.returncode == 0, done.stderr
     manifest = json.loads((folder / "controller.json").read_text())

@@ -159,6 +159,15 @@ def lane():
     return lane_with(control.mppi, num_samples=100, effective_samples=5.0)
 
 
+def nine(obstacles):
+    """With others that are not present, so that the drives are one program."""
+    missing = 9 - len(obstacles.present)
+    return jax.tree.map(
+        lambda leaf: np.pad(leaf, [(0, missing)] + (np.ndim(leaf) - 1) * [(0, 0)]),
+        obstacles,
+    )
+
+
 def drive(lane, road, seen, steps, *, speed=10.0, friction=0.9):
     """A car that is always where its reference says; `seen` gives what it sees."""
     driver, act = lane
@@ -166,7 +175,7 @@ def drive(lane, road, seen, steps, *, speed=10.0, friction=0.9):
     car = np.array([0.0, 0.0, 0.0, speed], np.float32)
     rows = []
     for number in range(steps):
-        scene = (road, seen(number, car))
+        scene = (road, nine(seen(number, car)))
         _, state, info = act(None, state, car, jnp.asarray([friction, 0.0]), scene)
         rows.append((car, state, jax.tree.map(np.asarray, info)))
         car = rows[-1][2].lane.reference[0]
@@ -183,11 +192,13 @@ def beside(road, places):
     return jnp.asarray(points[:, :2] + places[:, 1:] * normal)
 
 
+CLEARANCE = jit(partial(clearance, half=KIND.half))
+
+
 def room(car, posts):
     """Distance of a car from the nearest of them [m]."""
-    faces = jnp.stack([jnp.cos(car[2]), jnp.sin(car[2])])
-    where = jnp.asarray(car[:2])
-    return float(clearance(posts, where, direction=faces, half=KIND.half).min())
+    faces = np.float32([np.cos(car[2]), np.sin(car[2])])
+    return float(CLEARANCE(posts, np.float32(car[:2]), direction=faces).min())
 
 
 @pytest.mark.parametrize("planner", ["mppi", "cem"])
@@ -327,7 +338,9 @@ def test_what_is_attacked_is_not_admitted(lane, road, attack):
     if attack == "edge":
         posts, lane_now = none, road._replace(left=jnp.full(700, 0.5))
     before = state
-    _, state, info = act(None, state, car, jnp.asarray([0.9, 0.0]), (lane_now, posts))
+    _, state, info = act(
+        None, state, car, jnp.asarray([0.9, 0.0]), (lane_now, nine(posts))
+    )
     assert not bool(info.lane.admissible)
     assert bool(info.lane.stopping)
     assert bool(info.healthy) == (attack != "nan")

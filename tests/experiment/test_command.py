@@ -7,11 +7,12 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from helpers import last_line
 
 from sfkd_jax.experiment.command import hydra_command
 
 SCRIPT = """
-    import os
+    import json, os, sys
     from sfkd_jax.certification import CertificateStale, CertificationRefused
     from sfkd_jax.experiment.command import hydra_command
 
@@ -29,25 +30,61 @@ SCRIPT = """
             raise FAILS[seed]
         return {"objective": (seed - 7.0) ** 2, "run": str(run.directory)}
 
-    if __name__ == "__main__":
+    def start(number, arguments):
+        # A process of its own, which has imported everything.
+        if child := os.fork():
+            return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        for stream in (1, 2):
+            os.dup2(os.open(f"{number}.{stream}", os.O_CREAT | os.O_WRONLY), stream)
+        sys.argv[1:] = arguments
         hydra_command(main)()
+        sys.exit()
+
+    if __name__ == "__main__":
+        lines = json.loads(sys.argv[1])
+        print(json.dumps([start(k, arguments) for k, arguments in enumerate(lines)]))
 """
+
+
+def started(folder, *lines):
+    """How commands end that begin with these arguments: one import for all of them."""
+    (folder / "toy.py").write_text(textwrap.dedent(SCRIPT))
+    toy = [sys.executable, "toy.py", json.dumps(lines)]
+    done = subprocess.run(
+        toy, cwd=folder, capture_output=True, text=True, timeout=300, check=True
+    )
+    return [
+        subprocess.CompletedProcess(
+            line, code, *((folder / f"{k}.{stream}").read_text() for stream in (1, 2))
+        )
+        for k, (line, code) in enumerate(zip(lines, last_line(done), strict=True))
+    ]
 
 
 @pytest.fixture
 def toy(tmp_path):
-    (tmp_path / "toy.py").write_text(textwrap.dedent(SCRIPT))
+    """The command in a process that imports everything itself."""
+    return lambda *arguments: started(tmp_path, arguments)[0]
 
-    def start(*arguments):
-        return subprocess.run(
-            [sys.executable, "toy.py", *arguments],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
 
-    return start
+EXPECTED = {
+    "root=Größe": (1, "sfkd_jax: root=Größe: quote the value, 'root=\"Größe\"'"),
+    "seed=1": (1, "sfkd_jax: a job that cannot be done"),
+    "seed=2": (2, "sfkd_jax: refused: not below 1"),
+    "seed=3": (3, "sfkd_jax: stale: other weights"),
+    "seed=99": (130, "sfkd_jax: interrupted; the same command continues"),
+    "training.batch=0": (1, "sfkd_jax: training.batch must be in [1, inf), got 0"),
+}
+"""The exit status and the line of a command, by its argument."""
+SWEEP = ("-m", "+experiment=smoke", "training.steps=75,150", "seed=0,1,4")
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """How these commands and the sweep end."""
+    lines = (*((argument,) for argument in EXPECTED), SWEEP)
+    ended = started(tmp_path_factory.mktemp("toy"), *lines)
+    return dict(zip((*EXPECTED, "sweep"), ended, strict=True))
 
 
 def printed(done):
@@ -55,20 +92,14 @@ def printed(done):
     return [json.loads(line) for line in lines if line.startswith("{")]
 
 
-@pytest.mark.parametrize(
-    ("argument", "status", "line"),
-    [
-        ("root=Größe", 1, "sfkd_jax: root=Größe: quote the value, 'root=\"Größe\"'"),
-        ("seed=1", 1, "sfkd_jax: a job that cannot be done"),
-        ("seed=2", 2, "sfkd_jax: refused: not below 1"),
-        ("training.batch=0", 1, "sfkd_jax: training.batch must be in [1, inf), got 0"),
-    ],
-)
-def test_an_expected_error_is_one_line_and_an_exit_code(toy, argument, status, line):
-    done = toy(argument)
-    assert done.returncode == status
-    assert done.stderr.strip().splitlines() == [line]
-    assert printed(done) == []
+@pytest.mark.parametrize("argument", EXPECTED)
+def test_an_expected_error_is_one_line_and_an_exit_code(outcomes, argument):
+    done = outcomes[argument]
+    assert (done.returncode, done.stderr) == (
+        EXPECTED[argument][0],
+        f"{EXPECTED[argument][1]}\n",
+    )
+    assert done.stdout == ""
 
 
 def test_a_directory_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys):
@@ -81,16 +112,15 @@ def test_a_directory_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys)
     tmp_path.mkdir()
 
 
-def test_a_failed_job_of_a_sweep_does_not_lose_the_results_of_the_others(toy):
-    done = toy("-m", "+experiment=smoke", "training.steps=75,150", "seed=0,1,4,5")
+def test_a_failed_job_of_a_sweep_does_not_lose_the_results_of_the_others(outcomes):
+    """Nor does an expected error, nor a bug, end the jobs that follow."""
+    done = outcomes["sweep"]
     assert done.returncode == 1
-    runs = [document["run"] for document in printed(done)]
-    assert len(set(runs)) == len(runs) == 4
-    assert {Path(run).name for run in runs} == {"seed=0", "seed=5"}
-    assert {Path(run).parts[2] for run in runs} == {
-        "training.steps=75",
-        "training.steps=150",
-    }
+    runs = [Path(document["run"]) for document in printed(done)]
+    assert [(run.parts[2], run.name) for run in runs] == [
+        ("training.steps=75", "seed=0"),
+        ("training.steps=150", "seed=0"),
+    ]
     assert "a job that cannot be done" in done.stderr
     assert "a bug" in done.stderr
 
@@ -116,9 +146,3 @@ def test_a_study_searches_and_a_failed_trial_does_not_end_it(toy):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert printed(done)
-
-
-def test_an_interrupted_command_prints_one_line_and_exits_130(toy):
-    done = toy("seed=99")
-    assert done.returncode == 130
-    assert done.stderr == "sfkd_jax: interrupted; the same command continues\n"

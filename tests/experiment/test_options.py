@@ -28,12 +28,30 @@ def of(group):
     return [name for folder, name in OPTIONS if folder == group]
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_every_option_composes_and_is_within_the_ranges(group, option):
-    prefix = "+" if group == "experiment" else ""
-    own = ("model.factory=a:b",) if option == "own" and group == "model" else ()
-    logs = ("dataset.path=logs",) if (group, option) == ("dataset", "files") else ()
-    assert settings(f"{prefix}{group}={option}", *own, *logs).seed == 0
+TOGETHER = {
+    "first": "dataset=path training=path comparison=table1 scenario=s1 evaluation=standard",
+    "second": "dataset=tiny training=standard comparison=none scenario=s2 export=standard",
+    "third": "training=state_model environment=none scenario=s3 evaluation=benchmark",
+    "estimated": "environment=estimated comparison=benchmark scenario=obstacles",
+    "measured": "environment=measured comparison=benchmark_path dataset=standard",
+    "logs": "dataset=files dataset.path=logs environment=logged certification=standard",
+}
+"""Options that go together: a composition takes a third of a second."""
+TOGETHER |= {name: f"+experiment={name}" for name in of("experiment")}
+
+
+def test_every_option_is_composed_here():
+    """Models, controllers and vehicles are composed where they are built."""
+    words = {word.lstrip("+") for words in TOGETHER.values() for word in words.split()}
+    built = ("model", "controller", "vehicle")
+    assert {
+        f"{group}={option}" for group, option in OPTIONS if group not in built
+    } <= words
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_every_option_composes_and_is_within_the_ranges(name):
+    assert settings(*TOGETHER[name].split()).seed == 0
 
 
 @pytest.mark.parametrize("option", of("model"))
