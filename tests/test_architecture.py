@@ -85,6 +85,7 @@ ALLOWED_EVERYWHERE = set(sys.stdlib_module_names) | {PACKAGE, "jax", "jaxtyping"
 COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "geometry": {"numpy"},
+    "rollout": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
     "models": {"flax"},
     "control": {"numpy"},

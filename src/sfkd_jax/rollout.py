@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import (
-    BODY,
     Control,
     Environment,
     Fiber,
+    Frame,
     Key,
     Latent,
     Model,
@@ -277,16 +278,25 @@ def adjacent_windows(trajectories: Trajectory, *, length: int) -> Trajectory:
 
 
 def state_errors(
-    predicted: Float[Array, "time state"], true: Float[Array, "time state"]
+    frame: Frame,
+    predicted: Float[Array, "time state"],
+    true: Float[Array, "time state"],
 ) -> Float[Array, "time state"]:
-    """Return predicted minus true states.
+    """Return predicted minus true states, with angles wrapped.
 
-    The columns are the position error along and across the true yaw [m], the
-    wrapped yaw error [rad] and the error of the body state.
+    The columns are the position error along and across the true yaw [m], the yaw error
+    [rad] and the error of the body state.
+
+    Args:
+        frame: that says which entries are angles.
+        predicted: states.
+        true: states.
     """
-    position = jax.vmap(rotate)(-true[:, 2], predicted[:, :2] - true[:, :2])
-    yaw = wrap_angle(predicted[:, 2:3] - true[:, 2:3])
-    return jnp.concatenate([position, yaw, predicted[:, BODY] - true[:, BODY]], axis=1)
+    errors = predicted - true
+    position = jax.vmap(rotate)(-true[:, 2], errors[:, :2])
+    errors = jnp.concatenate([position, errors[:, 2:]], axis=1)
+    is_angle = np.isin(np.arange(errors.shape[1]), frame.angles)
+    return jnp.where(is_angle, wrap_angle(errors), errors)
 
 
 def in_batches(function: Callable[[Any], Any], items: Any, *, size: int) -> Any:

@@ -57,6 +57,13 @@ def test_operators_that_are_stable_one_by_one_have_no_common_lyapunov_matrix():
         prove_lyapunov(weights)
 
 
+def test_a_step_that_expands_has_no_lyapunov_matrix_though_its_operators_have():
+    *hidden, last = TURNED.residual
+    louder = TURNED._replace(residual=(*hidden, 1e3 * last))
+    with pytest.raises(CertificationRefused):
+        prove_lyapunov(louder)
+
+
 @pytest.fixture(scope="module")
 def claim():
     return prove_lyapunov(TURNED)

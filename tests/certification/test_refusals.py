@@ -6,10 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ENV_HIGH, ENV_LOW, certified, jit, model_and_params
+from helpers import (
+    ENV_HIGH,
+    ENV_LOW,
+    TINY,
+    certified,
+    jit,
+    model_and_params,
+    path_space,
+)
 
 import sfkd_jax
-from sfkd_jax import policy
+from sfkd_jax import models, policy
 from sfkd_jax.certification import (
     CertificateContradicted,
     CertificationRefused,
@@ -17,6 +25,7 @@ from sfkd_jax.certification import (
     prove,
 )
 from sfkd_jax.certification._weights import exported
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.types import Samples
 
 BOX = (ENV_LOW, ENV_HIGH)
@@ -49,6 +58,25 @@ def test_evidence_on_a_grid_is_refused_by_name():
         CertificationRefused, match="grid-only evidence: 49 sampled environments"
     ):
         prove(declaring(model, operators=operators), params, BOX)
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [
+        {"position": slice(3, 5), "yaw": slice(5, 6), "body": slice(6, None)},
+        {"yaw": slice(4, 5), "position": slice(3, 4), "body": slice(5, None)},
+        {"position": slice(3, 4), "roll": slice(4, 5), "body": slice(5, None)},
+        {"position": slice(3, 4)},
+    ],
+)
+def test_outputs_that_the_claims_are_not_about_are_refused(outputs):
+    """Claims are about rows of the read-out; they would be given wrong names."""
+    model = models.sfkd(path_space(), **TINY, frame=PATH_FRAME)
+    other = dataclasses.replace(PATH_FRAME, name="mine", outputs=outputs)
+    params = model.init(jax.random.key(0))
+    exported(model, params)
+    with pytest.raises(CertificationRefused, match="the frame 'mine' states"):
+        exported(model._replace(frame=other), params)
 
 
 def test_a_transport_that_stretches_is_found_out():

@@ -1,5 +1,6 @@
 """The contract of `Model`: all registered models, all variants, the physics rows."""
 
+from dataclasses import replace
 from functools import cache, partial
 
 import jax
@@ -23,6 +24,7 @@ from helpers import (
 )
 
 from sfkd_jax import models, paper
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.geometry import compose
 from sfkd_jax.models.sfkd import RESIDUALS
 from sfkd_jax.rollout import fold, rollout
@@ -200,6 +202,31 @@ def test_only_the_soft_variant_has_a_penalty_and_it_is_the_hinge_on_the_jacobian
     excess = np.linalg.norm(np.asarray(slope, np.float64), 2) - 0.1
     assert excess > 0
     np.testing.assert_allclose(penalty, excess**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("free", [1, 3])
+def test_what_planners_add_takes_any_number_of_controls(free):
+    """Of one and of three, with one input from the reference."""
+    frame = replace(PATH_FRAME, inputs=1)
+    scales = path_space()
+    size = free + frame.inputs
+    scales = scales._replace(control_mean=jnp.zeros(size), control_scale=jnp.ones(size))
+    frame = replace(
+        frame, following=lambda rho, body: jnp.zeros(body).at[1].set(rho[0])
+    )
+    model = models.sfkd(scales, **TINY, frame=frame, planning_residual=True)
+    params = jit(model.init)(jax.random.key(0))
+
+    @jit
+    def both(params, control):
+        fiber = model.planning.fiber(params, jnp.zeros(2))
+        state = jnp.zeros(6).at[4].set(control[free])
+        latent = model.planning.encode(fiber, state)
+        there = model.planning.on_reference(fiber, control[free:])
+        return [model.planning.step(at, latent, control) for at in (fiber, there)]
+
+    alone, shared = both(params, 0.1 * jnp.arange(1.0, size + 1.0))
+    np.testing.assert_allclose(alone, shared, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["path", "state", "sfkd"])

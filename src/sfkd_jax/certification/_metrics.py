@@ -159,7 +159,7 @@ def _accepted_lyapunov(metric: Matrix, weights: Exported) -> LyapunovClaim | Non
             joint=rows(joint),
         )
         holds = check_metric(metric, list(vertices), claim.rho, claim.condition)
-        if claim.rho < 1.0 and holds and contracts(claim, weights):
+        if max(claim.rho, claim.alpha) < 1.0 and holds and contracts(claim, weights):
             return claim
     return None
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from sfkd_jax.rollout import fold, on_host, unfold
-from sfkd_jax.types import Model, Params, Samples
+from sfkd_jax.types import BODY, BODY_FRAME, Frame, Model, Params, Samples
 
 ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
@@ -93,6 +93,7 @@ def exported(model: Model, params: Params) -> Exported:
     explicit = model.structure.explicit
     if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
+    _require_outputs(model.frame)
     weights = on_host(explicit, fold(model, params, on_host))
     # Every float32 number is a float64 number, so that nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
@@ -115,6 +116,24 @@ def exported(model: Model, params: Params) -> Exported:
         f"the transport {transport!r} is not known to be nonexpansive",
     )
     return weights
+
+
+def _require_outputs(frame: Frame) -> None:
+    """Refuse a frame with other outputs than those that the claims are about."""
+    stated = BODY_FRAME.outputs
+    if not frame.has_pose:
+        first = BODY.start
+        stated = {
+            "position": slice(first, first + 1),
+            "yaw": slice(first + 1, first + 2),
+            "body": slice(first + 2, None),
+        }
+    # Claims go by the order of the outputs, so it has to be the same as well.
+    require(
+        list(frame.outputs.items()) == list(stated.items()),
+        f"a certificate bounds the outputs {stated} of a state, in this order; the "
+        f"frame {frame.name!r} states {dict(frame.outputs)}",
+    )
 
 
 def fingerprint(params: Params) -> str:

@@ -1,4 +1,4 @@
-"""Driving data: generated or recorded, its parts, windows and scales."""
+"""Data sets: their parts, windows and scales."""
 
 from sfkd_jax.data._dataset import PARTS as PARTS
 from sfkd_jax.data._dataset import Dataset as Dataset

@@ -27,7 +27,7 @@ class Dataset(NamedTuple):
         env_high: upper corner of E.
         runs: number of independent runs that each part was cut from, by the name of the
             part; None if every trajectory is a run.
-        scenarios: index into `SCENARIOS` of every trajectory, by the name of the part;
+        scenarios: label of every trajectory, a whole number, by the name of the part;
             None for recorded runs.
     """
 
@@ -82,7 +82,7 @@ def split(
         shares: of the four parts, positive and of sum 1.
         env_low: lower corner of E, in units of e.
         env_high: upper corner of E.
-        scenarios: index into `SCENARIOS` of every trajectory, or None.
+        scenarios: label of every trajectory, a whole number, or None.
 
     Raises:
         ValueError: a part would be empty, a number is not finite, or an environment is

@@ -1,4 +1,4 @@
-"""Closed-loop and open-loop evaluation: episodes, scores and their statistics."""
+"""Errors in open loop, statistics, and formats of numbers."""
 
 from sfkd_jax.evaluation._open_loop import open_loop as open_loop
 from sfkd_jax.evaluation._statistics import holm as holm

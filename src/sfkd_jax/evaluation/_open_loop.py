@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.rollout import adjacent_windows, in_batches, rollout, state_errors
 from sfkd_jax.types import BODY, Model, Params, Trajectory
 
@@ -30,12 +29,10 @@ def open_loop(
     """
     windows = adjacent_windows(trajectories, length=horizon)
     frame = model.frame
-    angles = jnp.asarray(frame.angles)
 
     def squared_errors(window: Trajectory) -> Float[Array, "horizon column"]:
         predicted = rollout(model, params, window).free
-        errors = state_errors(predicted, window.states[1:])
-        errors = errors.at[:, angles].set(wrap_angle(errors[:, angles]))
+        errors = state_errors(frame, predicted, window.states[1:])
         return (errors if frame.has_pose else errors[:, BODY]) ** 2
 
     squares = in_batches(jax.vmap(squared_errors), windows, size=128)

@@ -174,7 +174,7 @@ class CertificationSettings:
     The other fields are arguments of `certification.prove` and `measure`.
 
     Attributes:
-        corridor: of `certification.corridor.measure_corridor`.
+        corridor: of `driving.corridor.measure_corridor`.
         renew: whether `certify` replaces a certificate of other weights.
         signing_key: path of a private ed25519 key in PEM that signs the certificate.
         horizon: number of steps of the tubes.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -62,6 +62,7 @@ class Sandwich(nn.Module):
     Source: Wang and Manchester, arXiv 2301.11526.
     """
 
+    is_bounded: ClassVar[bool] = True
     inputs: int
     hidden: Sequence[int]
     outputs: int
@@ -103,6 +104,7 @@ class Free(nn.Module):
     A model with it is certified only if it turns out to contract.
     """
 
+    is_bounded: ClassVar[bool] = False
     inputs: int
     hidden: Sequence[int]
     outputs: int

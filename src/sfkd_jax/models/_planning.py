@@ -27,10 +27,6 @@ from sfkd_jax.types import (
     State,
 )
 
-FREE = 2
-"""Number of entries of a control that differ between samples; the inputs ρ from the
-reference follow them.
-"""
 HIDDEN = 64
 """Hidden width of g without a reference; around a known one half is enough."""
 WIDTH = 64
@@ -100,6 +96,11 @@ class Planning:
     environment: bool
 
     @property
+    def _free(self) -> int:
+        """Number of entries of a control that differ between samples, before ρ."""
+        return self.space.control_mean.shape[0] - self.certified.frame.inputs
+
+    @property
     def _hidden(self) -> int:
         """Hidden width of g."""
         return HIDDEN // 2 if self.certified.frame.inputs else HIDDEN
@@ -109,7 +110,7 @@ class Planning:
         """Number of inputs of g, and the ends of its parts in the network's outputs."""
         body = self.space.body_mean.shape[0]
         pose = 3 if self.certified.frame.has_pose else 0
-        inputs = body + FREE
+        inputs = body + self._free
         outputs = body + pose
         affine = outputs * (inputs + 1)
         hidden = self._hidden * (inputs + 1)
@@ -149,7 +150,7 @@ class Planning:
 
     def step(self, fiber: PlanningFiber, state: State, control: Control) -> State:
         """Advance the state, or (s, 1) around a reference, by one sampling period."""
-        nu = control[:FREE]
+        nu = control[: self._free]
         g = fiber.residual
         if not self.certified.frame.inputs:
             after = self._certified(fiber, state, control)
@@ -160,7 +161,7 @@ class Planning:
             return g(state, nu)
         # For a single step, a product with the derivative is less work than the
         # derivative itself.
-        rho = control[FREE:]
+        rho = control[self._free :]
         certified, at = self._on_reference(fiber, rho)
         before, change = jax.jvp(certified, at, (state[:-1] - at[0], nu))
         weights, env = g
@@ -194,7 +195,8 @@ class Planning:
             return self._certified(fiber, without_pose(body), jnp.append(nu, rho))[BODY]
 
         size = self.space.body_mean.shape[0]
-        return certified, (self.certified.frame.following(rho, size), jnp.zeros(FREE))
+        body = self.certified.frame.following(rho, size)
+        return certified, (body, jnp.zeros(self._free))
 
     def model(self) -> Model:
         """Return F, in place of which planners roll out F + g."""
@@ -232,15 +234,15 @@ class Planning:
         inputs, ends = self._sizes
         network_inputs = env
         if rho is not None:
-            mean = space.control_mean[FREE:]
-            scale = space.control_scale[FREE:]
+            mean = space.control_mean[self._free :]
+            scale = space.control_scale[self._free :]
             network_inputs = jnp.append((rho - mean) / scale, env)
         outputs = self._network.apply({"params": weights}, network_inputs)
         affine, hidden, last = jnp.split(cast(Array, outputs), ends[:-1])
         affine = affine.reshape(-1, inputs + 1)
         hidden = hidden.reshape(-1, inputs + 1)
-        mean = jnp.append(space.body_mean, space.control_mean[:FREE])
-        scale = jnp.append(space.body_scale, space.control_scale[:FREE])
+        mean = jnp.append(space.body_mean, space.control_mean[: self._free])
+        scale = jnp.append(space.body_scale, space.control_scale[: self._free])
         units = jnp.asarray(space.body_scale)
         if self.certified.frame.has_pose:
             units = jnp.append(space.increment_scale, units)

@@ -160,7 +160,7 @@ def one_step_loss(model: Model) -> Loss:
     def error(params: Params, data: Trajectory) -> Scalar:
         after = rollout(model, params, data).single
         # Errors and scale are in the frame of the body.
-        errors = state_errors(after, data.states[1:])
+        errors = state_errors(model.frame, after, data.states[1:])
         return jnp.mean((errors / jax.lax.stop_gradient(params["scale"])) ** 2)
 
     return _mean_of(error)
@@ -180,7 +180,8 @@ def planning_loss(model: Model, params: Params, space: Space) -> Loss:
     def error(weights: Params, data: Trajectory) -> Scalar:
         folded = Folded({**params, "planning": weights}, frozen.shared)
         after = rollout(planning, folded, data).single
-        return jnp.mean((state_errors(after, data.states[1:]) * units) ** 2)
+        errors = state_errors(model.frame, after, data.states[1:])
+        return jnp.mean((errors * units) ** 2)
 
     return _mean_of(error)
 
@@ -219,7 +220,7 @@ def _window_parts(
         The parts of the loss, the prediction error with the default weights, and |d|.
     """
     predicted = rollout(model, params, data)
-    errors = state_errors(predicted.free, data.states[1:])
+    errors = state_errors(model.frame, predicted.free, data.states[1:])
 
     def prediction(growth: float) -> Scalar:
         # Errors grow about linearly. Without this factor the far steps would decide.
@@ -228,7 +229,8 @@ def _window_parts(
         return jnp.mean(jnp.sum(weighted, axis=1))
 
     # In millimetres: a slip of one millimetre a step hides in the sums over a window.
-    single = state_errors(predicted.single, data.states[1:]) * units / 0.001
+    single = state_errors(model.frame, predicted.single, data.states[1:])
+    single = single * units / 0.001
     # The regularisers are about the first state, and the fiber is that of its step.
     fiber = jax.tree.map(lambda leaf: leaf[0], predicted.fibers)
     other_fiber = model.fiber(params, other)

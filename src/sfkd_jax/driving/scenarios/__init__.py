@@ -1,12 +1,5 @@
 """Driving scenarios: paths, environment schedules, S1 to S3."""
 
-from sfkd_jax.driving.paths import Lap as Lap
-from sfkd_jax.driving.paths import Path as Path
-from sfkd_jax.driving.paths import path_from_curvature as path_from_curvature
-from sfkd_jax.driving.paths import path_through as path_through
-from sfkd_jax.driving.paths import point_at as point_at
-from sfkd_jax.driving.paths import project as project
-from sfkd_jax.driving.paths import reference_window as reference_window
 from sfkd_jax.driving.scenarios._conditions import BOX as BOX
 from sfkd_jax.driving.scenarios._conditions import gusts as gusts
 from sfkd_jax.driving.scenarios._conditions import held_road as held_road

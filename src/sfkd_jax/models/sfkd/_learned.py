@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.models._networks import SMALL, Free, Sandwich, Weights, bounded
+from sfkd_jax.models._networks import SMALL, Sandwich, Weights, bounded
 from sfkd_jax.models.sfkd._residual import separate_budget, share_budget
 from sfkd_jax.types import Scalar
 
@@ -103,7 +103,7 @@ class Learned(nn.Module):
     decoder_hidden: Sequence[int]
     rho: float
     beta: float
-    residual_class: type[Sandwich] | type[Free] | None
+    residual_class: type[Any] | None
     joint: bool
     learn_alpha: bool
     forcing_hidden: int
@@ -167,7 +167,7 @@ class Learned(nn.Module):
     @property
     def bounded(self) -> bool:
         """Whether a step contracts by construction."""
-        return self.residual_class is not Free
+        return self.residual_class is None or self.residual_class.is_bounded
 
     def rate(self) -> Scalar:
         """Return α = ρ + β, or less if it is learned."""

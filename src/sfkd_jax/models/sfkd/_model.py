@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sfkd_jax.models._networks import Encoder, Sandwich
+from sfkd_jax.models._networks import Encoder
 from sfkd_jax.models._planning import Planning
 from sfkd_jax.models.sfkd._latent_model import LatentModel
 from sfkd_jax.models.sfkd._learned import LOWEST_RATE, Learned
@@ -105,7 +105,9 @@ def sfkd(
         beta=beta,
         residual_class=residual_class,
         # A residual without a bound has none that the operators could share.
-        joint=budget == "joint" and residual_class is Sandwich,
+        joint=budget == "joint"
+        and residual_class is not None
+        and residual_class.is_bounded,
         transport=transport,
         pose=frame.has_pose,
         learn_alpha=learn_alpha,

@@ -1,6 +1,7 @@
 """The residual of SFKD, and the bound of a step.
 
-A residual is an entry of `RESIDUALS`: a flax module that is called like `Sandwich`. Its
+A residual is an entry of `RESIDUALS`: a flax module that is called like `Sandwich`, and
+whose `is_bounded` says whether its weights keep the bound that it is called with. Its
 value is W_L σ(… W_1 z + b_1(u, e) …) + b_L(u, e), because `Explicit` can state, and the
 trusted core can check, no other form. What planners alone add is in `Planning`.
 """
