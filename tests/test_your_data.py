@@ -21,7 +21,7 @@ from sfkd_jax.experiment import identified
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.store import ArtefactError
 
-sys.path.append(str(Path(__file__).parent / "data"))
+sys.path.append(str(Path(__file__).parent / "driving" / "logs"))
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 from recorded import NAMES, recorded_run, write_csv
 from recording import drive_by_hand, drive_under

@@ -21,7 +21,7 @@ OPTIONS = [
 ]
 LIMITS = ("vehicle.control_low=[-0.4,-3.0]", "vehicle.control_high=[0.4,2.0]")
 GIVEN = {"own": LIMITS, "logged": LIMITS}
-GIVEN |= {"simulator": ("vehicle.env=tests.plants.simulators:Faulty",)}
+GIVEN |= {"simulator": ("vehicle.env=tests.driving.plants.simulators:Faulty",)}
 
 
 def of(group):

@@ -18,7 +18,7 @@ SETTINGS = {
     "state_names": list(NAMES),
 }
 SETTINGS |= {name: list(values) for name, values in LIMITS.items()}
-EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 
 
 def test_a_step_is_named_in_the_settings_and_is_the_function_itself(monkeypatch):

@@ -14,10 +14,10 @@ from helpers import jit
 
 from sfkd_jax.driving import plants
 from sfkd_jax.experiment import evaluating
-from tests.plants import simulators
+from tests.driving.plants import simulators
 
-HERE = "tests.plants.simulators"
-EXAMPLES = str(Path(__file__).parents[2] / "examples")
+HERE = "tests.driving.plants.simulators"
+EXAMPLES = str(Path(__file__).parents[3] / "examples")
 
 
 @pytest.fixture(scope="module")
