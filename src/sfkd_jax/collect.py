@@ -10,10 +10,10 @@ import numpy as np
 
 from sfkd_jax import certificate as certificates
 from sfkd_jax import policy, store
+from sfkd_jax.certification import check_count
 from sfkd_jax.driving.certificate import RecordedConditions
 from sfkd_jax.driving.corridor import (
     calibrate_on_runs,
-    check_count,
     closed_loop,
     corridor_coverage,
     scores_of_runs,

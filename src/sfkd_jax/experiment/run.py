@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.certification import boxes_of
+from sfkd_jax.certification import boxes_of, check_count
 from sfkd_jax.data import Dataset
-from sfkd_jax.driving.corridor import check_count
 from sfkd_jax.driving.path_following import PathLaw
 from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.experiment import run_directory

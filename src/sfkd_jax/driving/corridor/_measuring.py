@@ -27,7 +27,6 @@ from sfkd_jax.certification import (
     residuals,
     rows,
 )
-from sfkd_jax.certification import check_count as check_count
 from sfkd_jax.driving.certificate import (
     Bounds,
     Conditions,
@@ -45,9 +44,12 @@ from sfkd_jax.driving.corridor._alarms import (
     sensor_effect,
     simulate_nominal,
 )
-from sfkd_jax.driving.corridor._alarms import closed_loop as closed_loop
-from sfkd_jax.driving.corridor._bounds import ALONE, JOINT, calibrate_corridor
-from sfkd_jax.driving.corridor._bounds import corridor_coverage as corridor_coverage
+from sfkd_jax.driving.corridor._bounds import (
+    ALONE,
+    JOINT,
+    calibrate_corridor,
+    corridor_coverage,
+)
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.driving.drives import drive_along_path, from_s3
 from sfkd_jax.driving.path_coordinates import LATERAL
