@@ -19,13 +19,14 @@ PACKAGE = SRC.name
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
-CORE = {"info", "types", "geometry", "rollout", "ranges"}
+CORE = {"info", "types", "geometry", "rollout", "ranges", "latency"}
 GROUND = {
     "info": set(),
     "types": {"info"},
     "ranges": set(),
     "geometry": {"types"},
     "rollout": {"types", "geometry"},
+    "latency": {"types", "geometry", "ranges"},
     "settings": {"ranges"},
     "store": set(),
     "certificate": {"ranges", "store"},
@@ -50,7 +51,7 @@ DRIVING = {
     "driving.drives": PLANT | {"data", "store"},
     "driving.logs": PLANT | {"data", "store"},
     "driving.simulation": PLANT | {"evaluation"},
-    "driving.certificate": {"ranges", "store", "certificate"},
+    "driving.certificate": {"ranges", "store", "certificate", "latency"},
     "driving.corridor": PLANT
     | {"certificate", "certification", "control", "data"}
     | {"driving.certificate", "driving.drives", "driving.path_following"},
@@ -86,6 +87,7 @@ COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "geometry": {"numpy"},
     "rollout": {"numpy"},
+    "latency": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
     "models": {"flax"},
     "control": {"numpy"},

@@ -63,6 +63,21 @@ def between(
     return jnp.concatenate([position, wrap_angle(pose_next[2:] - pose[2:])])
 
 
+def along_arc(
+    pose: Float[Array, " 3"], pose_next: Float[Array, " 3"], share: float
+) -> Float[Array, " 3"]:
+    """Return the pose after a share of the way from g to g', on a circular arc.
+
+    The chord of a share f of an arc that turns by θ has the direction of the whole
+    chord, turned back by (1 − f) θ/2; its length is f times that of the whole chord, up
+    to θ²/24 of it.
+    """
+    motion = between(pose, pose_next)
+    turned_back = -0.5 * (1.0 - share) * motion[2]
+    chord = share * rotate(turned_back, motion[:2])
+    return compose(pose, jnp.concatenate([chord, share * motion[2:]]))
+
+
 def without_pose(body: Float[Array, " body"]) -> State:
     """Return a state with this body, whose pose is (0, 0, 0)."""
     return jnp.concatenate([jnp.zeros(3), body])

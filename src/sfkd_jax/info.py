@@ -53,7 +53,8 @@ _ADVICE = {
     Reason.NO_CERTIFICATE: "The controller has no certified corridor: certify it.",
     Reason.NOT_CALIBRATED: (
         "The corridor is that of a model of logs, and not of the system itself: record "
-        "runs of the system, and collect them."
+        "runs of the system, and collect them. Or it is that of another latency: "
+        "certify with the latency of the system."
     ),
     Reason.ROLLING: (
         "The system is slower than the certificate covers; the bound goes on from its "

@@ -28,9 +28,9 @@ from sfkd_jax.assembly._controller_settings import (
     controller_horizon as controller_horizon,
 )
 from sfkd_jax.assembly._controllers import build_controller as build_controller
-from sfkd_jax.assembly._controllers import build_in_lane as build_in_lane
 from sfkd_jax.assembly._corridor import corridor_of as corridor_of
 from sfkd_jax.assembly._corridor import in_corridor as in_corridor
+from sfkd_jax.assembly._lanes import build_in_lane as build_in_lane
 from sfkd_jax.assembly._vehicles import IDENTIFIED as IDENTIFIED
 from sfkd_jax.assembly._vehicles import LOGGED as LOGGED
 from sfkd_jax.assembly._vehicles import PLANTS as PLANTS

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import ceil
 from typing import Any
 
 from sfkd_jax import control, paper
 from sfkd_jax.driving import path_following
+from sfkd_jax.latency import ON_TIME, CommandDelay
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller
 
@@ -41,6 +43,7 @@ _NO_SETTINGS = (
     "conditions",
     "reads_env",
     "test",
+    "delay",
 )
 """Arguments of controllers that are no settings."""
 
@@ -143,6 +146,10 @@ CONTROLLER_SETTINGS = {planner: _controller_schema(planner) for planner in PLANN
 """The dataclass of the settings of a controller, by planner."""
 
 
-def controller_horizon(settings: ControllerSettings | Values) -> int:
+def controller_horizon(
+    settings: ControllerSettings | Values, delay: CommandDelay = ON_TIME
+) -> int:
     """Return how many steps of the reference a controller reads."""
-    return parse(ControllerSettings, settings, "controller.").horizon
+    horizon = parse(ControllerSettings, settings, "controller.").horizon
+    # The road until the command acts is needed as well.
+    return horizon + ceil(delay.first)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from sfkd_jax import control
 from sfkd_jax.assembly._controller_settings import (
@@ -12,31 +11,17 @@ from sfkd_jax.assembly._controller_settings import (
     ControllerSettings,
     SearchSettings,
 )
-from sfkd_jax.assembly._corridor import Corner, conditions_of, corridor_of, in_corridor
+from sfkd_jax.assembly._corridor import Corner, conditions_of, in_corridor
 from sfkd_jax.driving import path_following, plants
 from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.driving.path_coordinates import (
-    CURVATURE,
-    HEADING,
     PATH_FRAME,
-    PATH_SPEED,
-    REFERENCE_SPEED,
 )
+from sfkd_jax.latency import NO_LATENCY, CommandDelay, Latency
 from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
 from sfkd_jax.types import Controller, Model
 
-REFERENCE_SEARCH = {
-    "horizon": 1,
-    "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0),
-    "noise": "white",
-}
-"""Settings of every planner that searches for a reference in a lane."""
-REFERENCE_PLANNERS: dict[str, Any] = {
-    "mppi": {"num_samples": 300, "effective_samples": 5.0},
-    "cem": {"num_samples": 100, "iterations": 3, "elites": 10},
-}
-"""Further settings of such a planner, by its name."""
 MODEL_ERROR = {
     "e_y": 1e-3,
     "e_psi": 3e-4,
@@ -60,6 +45,7 @@ def build_controller(
     law: path_following.PathLaw | None = None,
     adaptive: bool = False,
     planner: Controller | None = None,
+    latency: Latency = NO_LATENCY,
 ) -> Controller:
     """Return the planner of the settings with its shield and adaptation.
 
@@ -76,11 +62,12 @@ def build_controller(
             errors of its inputs while driving, even if the settings do not say so; with
             "estimated" it always does.
         planner: along a path, to be shielded in place of that of the settings.
+        latency: of the vehicle, which a controller along a path takes into account.
 
     Raises:
         ValueError: an unknown planner, a vehicle without limits of its controls, a
-            model and a planner in different coordinates, or adaptation without path
-            coordinates.
+            model and a planner in different coordinates, or adaptation or latency
+            without path coordinates.
     """
     settings = parse(ControllerSettings, settings, "controller.")
     # A vehicle of logs has no limits before its logs are read.
@@ -101,6 +88,10 @@ def build_controller(
                 "adaptation and environment.source=estimated need a model "
                 "in path coordinates: model.frame=path"
             )
+        if not latency.is_none:
+            raise ValueError(
+                "latency needs a model in path coordinates: model.frame=path"
+            )
         return _planner_in_the_world(settings, model, plant, env_box)
     # A quadratic program samples nothing: no law, shield or adaptation around it.
     if (
@@ -111,17 +102,36 @@ def build_controller(
         raise ValueError(
             "a model in path coordinates needs controller.sampling=law and its law"
         )
-    loop = _Loop(model, plant, law, env_box, estimates_env)
-    # From the inside to the outside: planner, shield, adaptation, gate, projection.
+    sized = latency.sized(len(plant.states), len(plant.controls))
+    loop = _Loop(model, plant, law, env_box, estimates_env, sized)
+    return _layers(settings, loop, certificate, adaptive=adaptive, planner=planner)
+
+
+def _layers(
+    settings: SearchSettings,
+    loop: _Loop,
+    certificate: DrivingCertificate | None,
+    *,
+    adaptive: bool,
+    planner: Controller | None,
+) -> Controller:
+    """Return a controller along a path with its layers, from the inside to the outside.
+
+    These are planner, shield, prediction, adaptation, gate and projection.
+    """
     inner = planner
     if inner is None:
         inner = _planner_along_path(settings, loop, adaptive=adaptive)
+    # Shield and prediction have the certified model, not that of the planner.
+    certified = with_offset(loop.model) if adaptive else loop.model
     # A shield needs a certified corridor; without one the planner drives alone.
     shielded = planner is not None or settings.shield
     if shielded and certificate is not None and certificate.corridor is not None:
-        # It predicts with the certified model, not with that of the planner.
-        certified = with_offset(model) if adaptive else model
-        inner = in_corridor(inner, certified, plant, law, certificate)
+        inner = in_corridor(
+            inner, certified, loop.plant, loop.law, certificate, latency=loop.latency
+        )
+    if loop.delay.first:
+        inner = _predicting(inner, certified, loop, certificate)
     if adaptive:
         inner = _adapting(inner, settings, loop)
     return _along_reference(inner, settings, loop, certificate)
@@ -136,6 +146,7 @@ class _Loop(NamedTuple):
         law: around which the model was learned.
         env_box: corners env_low and env_high of the box of e, None if unknown.
         estimates_env: whether e is estimated while driving, not measured.
+        latency: of the vehicle, for each state and control.
     """
 
     model: Model
@@ -143,6 +154,12 @@ class _Loop(NamedTuple):
     law: path_following.PathLaw
     env_box: dict[str, Any]
     estimates_env: bool
+    latency: Latency
+
+    @property
+    def delay(self) -> CommandDelay:
+        """The delays of the commands after an observation."""
+        return self.latency.loop(self.plant.dt)
 
 
 def _as_floats(corner: Corner) -> tuple[float, ...] | None:
@@ -251,11 +268,31 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
         model=loop.model.planning or loop.model,
         law=loop.law,
         estimate_env=loop.estimates_env,
+        delay=loop.delay,
         **_limits(loop.plant),
         **loop.env_box,
         **options,
     )
     return adaptation.controller()
+
+
+def _predicting(
+    inner: Controller,
+    model: Model,
+    loop: _Loop,
+    certificate: DrivingCertificate | None,
+) -> Controller:
+    """Return a controller along a path on the state at which its command will act."""
+    prediction = path_following.Prediction(
+        model=model,
+        law=loop.law,
+        dt=loop.plant.dt,
+        conditions=conditions_of(certificate, **loop.env_box),
+    )
+    predictor = path_following.Predictor(
+        inner=inner, prediction=prediction, delay=loop.delay
+    )
+    return predictor.controller()
 
 
 def _noise_to_learn_from(plant: plants.Vehicle) -> tuple[float, ...]:
@@ -302,80 +339,18 @@ def _along_reference(
         model=loop.model,
         law=loop.law,
         dt=loop.plant.dt,
-        horizon=settings.horizon,
+        horizon=settings.horizon + ceil(loop.delay.first),
         conditions=conditions_of(certificate, **loop.env_box),
         reads_env=not loop.estimates_env,
         test=test,
+        delay=loop.delay,
         **arguments(settings.gate, path_following.Gate),
     )
     # Here and nowhere else observation and reference become ξ and preview.
     coordinates = loop.law.gain.shape[-1]
-    return path_following.along_reference(gate.controller(), coordinates=coordinates)
-
-
-def build_in_lane(
-    inner: Controller,
-    plant: plants.Vehicle,
-    law: path_following.PathLaw,
-    certificate: DrivingCertificate,
-    *,
-    horizon: int,
-    car: tuple[float, float],
-    planner: str,
-    friction: int | None,
-) -> Controller:
-    """Return a controller that drives in a lane, see `path_following.InLane`.
-
-    Args:
-        inner: the shielded controller of references.
-        plant: vehicle.
-        law: around which the model was learned.
-        certificate: with a corridor, whose class the references keep.
-        horizon: how many steps of the reference `inner` reads.
-        car: length and width [m].
-        planner: that searches for a reference, in `PLANNERS`.
-        friction: entry of e that is the friction; None if none is.
-    """
-    admissible = _admissible_references(plant, law, certificate, car)
-    manoeuvres = path_following.Manoeuvres(kind=admissible, dt=plant.dt)
-    options = {**REFERENCE_SEARCH, **REFERENCE_PLANNERS.get(planner, {})}
-    speed_gain = float(np.mean(law.gain[..., 1, PATH_SPEED]))
-    return path_following.in_lane(
-        inner=inner,
-        planner=PLANNERS[planner](manoeuvres.task(), **options),
-        manoeuvres=manoeuvres,
-        horizon=horizon,
-        lead=0.0 if plant.speed_loop else 1.0 / speed_gain,
-        friction=friction,
-        lowest=certificate.measured.boxes.env[0][friction or 0],
-    )
-
-
-def _admissible_references(
-    plant: plants.Vehicle,
-    law: path_following.PathLaw,
-    certificate: DrivingCertificate,
-    car: tuple[float, float],
-) -> path_following.Class:
-    """Return the class of references of which a corridor was certified."""
-    corridor = corridor_of(certificate)
-    conditions = corridor.conditions
-    road_low, road_high = certificate.measured.boxes.control
-    state_box = conditions_of(certificate).state
-    heading = 0.0
-    if state_box is not None:
-        heading = max(abs(end[HEADING]) for end in state_box)
-    return path_following.Class(
-        curvature=min(conditions.peak_curvature, road_high[CURVATURE]),
-        turning=conditions.curvature_slope,
-        lateral=min(conditions.lateral_acceleration, float(law.high[0])),
-        jerk=conditions.lateral_jerk,
-        speed=(road_low[REFERENCE_SPEED], road_high[REFERENCE_SPEED]),
-        half=(0.5 * car[0], 0.5 * car[1]),
-        corridor=corridor.corridor_m,
-        heading=heading,
-        change=conditions.acceleration,
-        # The rest is left for what the speed lags behind.
-        deceleration=0.75 * conditions.acceleration,
-        braking=6.0 if plant.speed_loop else -plant.control_low[1],
+    return path_following.along_reference(
+        gate.controller(),
+        coordinates=coordinates,
+        delay=loop.delay,
+        hold_back=loop.latency.hold_back(loop.plant.dt),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from sfkd_jax.driving import path_following, plants
 from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
+from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
@@ -43,6 +45,8 @@ def in_corridor(
     plant: plants.Vehicle,
     law: path_following.PathLaw,
     certificate: DrivingCertificate,
+    *,
+    latency: Latency = NO_LATENCY,
 ) -> Controller:
     """Return the planner with a shield that keeps the corridor of a certificate.
 
@@ -52,10 +56,18 @@ def in_corridor(
         plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
         certificate: with a corridor.
+        latency: of the vehicle. Nothing is claimed if it is
+            not that of the certificate.
     """
     corridor = corridor_of(certificate)
     bounds = corridor.bounds
     lateral_noise, heading_noise = _sensor_noise(corridor)
+    # Until the command acts, an error of the heading moves the car sideways.
+    way = corridor.conditions.speed[1] * plant.dt * latency.loop(plant.dt).first
+    lateral_noise = math.hypot(lateral_noise, way * heading_noise)
+    sizes = (len(plant.states), len(plant.controls))
+    latency = latency.sized(*sizes)
+    calibrated = corridor.conditions.latency.sized(*sizes)
     # What the heading's noise moves the car sideways until the law has turned it back.
     steering = np.asarray(law.gain)[..., 0, :]
     ratio = float(np.max(steering[..., HEADING] / steering[..., LATERAL]))
@@ -73,7 +85,7 @@ def in_corridor(
         conditions=conditions_of(certificate),
         dt=plant.dt,
         rear=_slip_of_gentle_turns(law),
-        claimed=corridor.is_claimed,
+        claimed=corridor.is_claimed and calibrated == latency,
     ).controller()
 
 

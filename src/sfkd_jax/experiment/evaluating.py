@@ -187,6 +187,7 @@ class SystemEvaluation:
             certificate=system.certificate,
             env_source=system.env_source,
             law=system.law,
+            latency=run.latency,
         )
         if has_course(settings.scenario):
             self.controller = _in_lane(run, name, system, self.controller)
@@ -197,9 +198,10 @@ class SystemEvaluation:
             simulation.simulate,
             plant.step,
             self.controller,
-            horizon=settings.controller.horizon,
+            horizon=_preview(run),
             dt=plant.dt,
             observation_noise=run.sensors,
+            latency=run.latency,
             size=plant.size,
         )
         self._simulate = _over_episodes(simulate)
@@ -247,6 +249,12 @@ class SystemEvaluation:
         return episode, scores
 
 
+def _preview(run: Run) -> int:
+    """Return how many points of the reference a controller of the run reads."""
+    delay = run.latency.loop(run.plant.dt)
+    return assembly.controller_horizon(run.settings.controller, delay)
+
+
 def has_course(scenario: ScenarioSettings) -> bool:
     """Return whether there are obstacles on the road, and scenes, not references."""
     return scenario.name in COURSES
@@ -265,7 +273,7 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
         run.plant,
         system.law,
         certificate,
-        horizon=run.settings.controller.horizon,
+        horizon=_preview(run),
         car=run.plant.size,
         planner="mppi",
         friction=0,

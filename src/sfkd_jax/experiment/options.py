@@ -21,6 +21,7 @@ from sfkd_jax.driving import drives, simulation
 from sfkd_jax.driving.corridor import measure_corridor
 from sfkd_jax.driving.plants import KNOWN_STATES, Vehicle, described
 from sfkd_jax.driving.scenarios import DriveClass
+from sfkd_jax.latency import Latency
 from sfkd_jax.ranges import (
     Bounds,
     Fraction,
@@ -266,6 +267,14 @@ class ExportSettings:
     """Arguments of `export.write_controller`."""
 
 
+@takes(Latency)
+class LatencySettings:
+    """The arguments of `Latency`: what is late when a policy is certified and driven.
+
+    Data and training do not depend on it.
+    """
+
+
 @takes()
 class DemoSettings:
     """Episodes of `demo`.
@@ -305,6 +314,7 @@ class Settings:
     model: ModelSettings
     controller: ControllerSettings
     training: TrainingSettings
+    latency: LatencySettings
     certification: CertificationSettings
     evaluation: EvaluationSettings
     comparison: ComparisonSettings

@@ -16,9 +16,10 @@ from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import train_policy
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.experiment.source import DataSource
+from sfkd_jax.latency import Latency
 from sfkd_jax.policy import CERTIFICATE, TrainedModel, restore
 from sfkd_jax.ranges import imported
-from sfkd_jax.settings import replace
+from sfkd_jax.settings import arguments, replace
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +82,12 @@ class Run:
     def sensors(self) -> tuple[float, ...]:
         """Standard deviations of the sensors of the vehicle, one a state."""
         return self.settings.evaluation.sensors(self.plant)
+
+    @cached_property
+    def latency(self) -> Latency:
+        """The latency of the vehicle, for each state and control."""
+        latency = Latency(**arguments(self.settings.latency, Latency))
+        return latency.sized(len(self.plant.states), len(self.plant.controls))
 
     @cached_property
     def identity(self) -> dict[str, Any]:

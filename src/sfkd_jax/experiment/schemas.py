@@ -30,7 +30,7 @@ def _schemas() -> dict[tuple[str, str], Any]:
     schemas = {}
     for group, hint in get_type_hints(Settings).items():
         # The primary config states the values of these commands itself.
-        if not is_dataclass(hint) or group in ("demo", "collect"):
+        if not is_dataclass(hint) or group in ("demo", "collect", "latency"):
             continue
         for variant, dataclass_type in variants.get(group, {"": hint}).items():
             schemas[group, f"{variant}_schema" if variant else "schema"] = (

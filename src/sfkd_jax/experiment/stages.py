@@ -76,6 +76,7 @@ def check_settings(run: Run) -> None:
         env_high=(1.0,) * sizes.env,
         law=law,
         env_source=settings.environment.source,
+        latency=run.latency,
     )
 
 
@@ -141,7 +142,7 @@ def certify_policy(run: Run) -> DrivingCertificate | Refusal:
         weights_sha256=trained.weights_sha256,
         versions={**store.versions(), "scipy": version("scipy")},
         seconds=0.0,
-        settings=_recorded_certification(settings),
+        settings=_recorded_certification(run),
     )
     try:
         certificate: DrivingCertificate | Refusal = _certify(run, trained, provenance)
@@ -174,9 +175,11 @@ def _verdict(
     return f"{verdict}; d_bar {d_bar.one_step.latent:.4g} {holds}"
 
 
-def _recorded_certification(settings: CertificationSettings) -> dict[str, Any]:
+def _recorded_certification(run: Run) -> dict[str, Any]:
     """Return the settings of the certification that a certificate records."""
-    recorded = store.plain(settings)
+    recorded = store.plain(run.settings.certification)
+    if not run.latency.is_none:
+        recorded["latency"] = store.plain(run.settings.latency)
     # They say what to do, and not what is claimed.
     del recorded["renew"]
     del recorded["signing_key"]
@@ -244,6 +247,7 @@ def _measure_corridor(run: Run, trained: policy.TrainedModel, proof: Proof) -> C
         trained.params,
         trained.law,
         run.sensors,
+        run.latency,
     )
     return measure_corridor(
         loop,
@@ -266,7 +270,7 @@ def ensure_certificate(run: Run) -> None:
         _ = run.policy
         if (path := run.certificate_path).exists():
             recorded = store.read_json(path).get("provenance", {}).get("settings")
-            wanted = _recorded_certification(run.settings.certification)
+            wanted = _recorded_certification(run)
             if not store.differences(recorded or {}, wanted):
                 return
         certify_policy(run)

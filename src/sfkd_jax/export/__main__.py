@@ -28,6 +28,8 @@ def main(run: Run) -> dict[str, Any]:
             run_dir,
             controller=store.plain(settings.controller),
             env_source=settings.environment.source,
+            # None: that of the certificate.
+            latency=None if run.latency.is_none else run.latency,
         )
         # Not refused: a controller without a certificate drives as well.
         if trained.certificate is None:

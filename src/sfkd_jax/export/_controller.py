@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sfkd_jax import assembly, policy, store
+from sfkd_jax import policy, store
 from sfkd_jax.certificate import write
 from sfkd_jax.driving.lanes import Lane, Obstacles
 from sfkd_jax.driving.paths import Path as Road
@@ -322,7 +322,7 @@ def _example_inputs(trained: Policy) -> tuple[Any, ...]:
     key = jax.eval_shape(partial(jax.random.key, 0))
     state = jax.eval_shape(trained.controller.init, key)
     settings = trained.settings
-    horizon = assembly.controller_horizon(settings["controller"])
+    horizon = trained.interface["horizon"]
     return (
         key,
         state,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
@@ -18,6 +18,7 @@ from sfkd_jax.certificate import describe_signature
 from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.driving.path_following import in_the_world
 from sfkd_jax.geometry import relative, shifted
+from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
 from sfkd_jax.policy._certificate import RECORDED as RECORDED
 from sfkd_jax.policy._certificate import read_certificate as read_certificate
@@ -50,21 +51,23 @@ class Policy(TrainedModel):
             or "signed by …".
         around: (planner=another along a path) -> controller, see
             `assembly.build_controller`.
+        latency: of the vehicle, which the controller compensates.
     """
 
     controller: Controller
     certificate: DrivingCertificate | None
     signature: str
     around: Callable[..., Controller]
+    latency: Latency
 
     @property
     def interface(self) -> dict[str, Any]:
         """Names, units and limits of controls, observation, e and reference."""
-        return interface_of(self, self.certificate)
+        return interface_of(self, self.certificate, self.latency)
 
     def __repr__(self) -> str:
         """Say what it drives, where its certificate applies, and what is proved."""
-        return describe(self, self.certificate, self.signature)
+        return describe(self, self.certificate, self.signature, self.latency)
 
     def _with_corridor(self) -> DrivingCertificate:
         """Return the certificate, or raise a ValueError if it has no corridor."""
@@ -147,6 +150,7 @@ def load(
     controller: Mapping[str, Any] | None = None,
     env_source: str = "measured",
     adaptive: bool = False,
+    latency: Latency | None = None,
     signed_by: str | Path | None = None,
 ) -> Policy:
     """Return the policy in a run directory, with its certificate verified.
@@ -162,6 +166,8 @@ def load(
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
             errors of its inputs while driving, see `path_following.Adaptation`.
+        latency: of the vehicle, which the controller compensates. None for the one of
+            the certificate. With another one nothing is claimed.
         signed_by: public ed25519 key of who must have signed the certificate, as 64
             hexadecimal digits or the path of a PEM file. Only a signature vouches for
             measured numbers. None to accept an unsigned certificate, too.
@@ -169,8 +175,8 @@ def load(
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold, or one that
             `signed_by` has not signed.
-        ValueError: `controller` or `env_source` does not fit the policy, or an estimate
-            is asked of a policy that is not in path coordinates.
+        ValueError: `controller`, `env_source` or `latency` does not fit the policy, or
+            an estimate is asked of a policy that is not in path coordinates.
     """
     file = policy_file(path)
     trained = restore(path)
@@ -180,9 +186,9 @@ def load(
     with store.as_artefact_error(file):
         reads_env = trained.settings["model"].get("environment", True)
         settings = _driving_settings(trained.settings, controller, env_source)
-        shielded = settings["controller"].get("shield")
+    has_corridor = certificate is not None and certificate.corridor is not None
     # Never the same planner without its shield, unless the caller says so.
-    if shielded and (certificate is None or certificate.corridor is None):
+    if settings["controller"].get("shield") and not has_corridor:
         raise store.ArtefactError(
             f"{file}: controller.shield needs a certified corridor, and "
             f"{reason or 'the certificate has none'}; run certify, or load it with "
@@ -190,11 +196,10 @@ def load(
         )
     _check_env_source(env_source, reads_env)
     # Errors are about the file, unless the caller asked for something else.
-    as_saved = controller is None and env_source == "measured" and not adaptive
-    errors: AbstractContextManager[None] = nullcontext()
-    if as_saved:
-        errors = store.as_artefact_error(file, ValueError)
-    with errors:
+    unchanged = controller is None and latency is None
+    as_saved = unchanged and env_source == "measured" and not adaptive
+    with store.as_artefact_error(file, ValueError) if as_saved else nullcontext():
+        latency = _latency_of(trained, certificate, latency)
         around = partial(
             assembly.build_controller,
             settings["controller"],
@@ -206,6 +211,7 @@ def load(
             certificate=certificate,
             law=trained.law,
             adaptive=adaptive,
+            latency=latency,
         )
         planner = around()
     signature = "unsigned"
@@ -220,7 +226,27 @@ def load(
         certificate=certificate,
         signature=signature,
         around=around,
+        latency=latency,
     )
+
+
+def _latency_of(
+    trained: TrainedModel,
+    certificate: DrivingCertificate | None,
+    latency: Latency | None,
+) -> Latency:
+    """Return the latency to drive with, for each state and control.
+
+    Args:
+        trained: the policy.
+        certificate: whose corridor states the latency that it was measured with.
+        latency: that the caller states, or None.
+    """
+    if latency is None:
+        corridor = certificate.corridor if certificate else None
+        latency = corridor.conditions.latency if corridor else NO_LATENCY
+    vehicle = trained.vehicle
+    return latency.sized(len(vehicle.states), len(vehicle.controls))
 
 
 def _driving_settings(

@@ -6,14 +6,15 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import assembly
-from sfkd_jax.driving.certificate import Conditions, DrivingCertificate
-from sfkd_jax.driving.plants import axes
+from sfkd_jax.driving.certificate import Conditions, DrivingCertificate, LawMargins
+from sfkd_jax.driving.plants import Vehicle, axes
+from sfkd_jax.latency import Latency
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
 
 
 def interface_of(
-    trained: TrainedModel, certificate: DrivingCertificate | None
+    trained: TrainedModel, certificate: DrivingCertificate | None, latency: Latency
 ) -> dict[str, Any]:
     """Return names, units and limits of controls, observation, e and reference."""
     vehicle = trained.vehicle
@@ -24,7 +25,18 @@ def interface_of(
     labels = [entry.label for entry in vehicle.environment]
     return {
         "sampling_period_s": vehicle.dt,
-        "horizon": assembly.controller_horizon(trained.settings["controller"]),
+        "horizon": assembly.controller_horizon(
+            trained.settings["controller"], latency.loop(vehicle.dt)
+        ),
+        "latency_s": {
+            "sensors": dict(zip(vehicle.state_names, latency.sensors, strict=True)),
+            "controls": {
+                control.name: delay
+                for control, delay in zip(
+                    vehicle.controls, latency.controls, strict=True
+                )
+            },
+        },
         "controls": [
             {"name": control.label, "low": control.low, "high": control.high}
             for control in vehicle.controls
@@ -40,7 +52,10 @@ def interface_of(
 
 
 def describe(
-    trained: TrainedModel, certificate: DrivingCertificate | None, signature: str
+    trained: TrainedModel,
+    certificate: DrivingCertificate | None,
+    signature: str,
+    latency: Latency,
 ) -> str:
     """Return what a policy drives, where its certificate applies, what is proved.
 
@@ -48,9 +63,10 @@ def describe(
         trained: the policy.
         certificate: its verified certificate, or None.
         signature: who signed the certificate, in words.
+        latency: that the controller compensates, for each state and control.
     """
     vehicle = trained.vehicle
-    interface = interface_of(trained, certificate)
+    interface = interface_of(trained, certificate, latency)
     has_pose = trained.model.frame.has_pose
     frame = "in the world" if has_pose else "along a path"
     states = [state.label for state in vehicle.states]
@@ -67,12 +83,29 @@ def describe(
         f"controls: {controls}",
         f"environment, {source}: {in_words(box['names'], box['low'], box['high'])}",
     ]
+    if not latency.is_none:
+        lines.append(_latency_in_words(vehicle, latency))
     if certificate:
         lines.append(_certified_box(certificate, trained))
         lines.extend(_certified_facts(certificate, signature, box["names"]))
     else:
         lines.append("no certificate: nothing is proved, nothing measured")
     return "\n  ".join(lines)
+
+
+def _latency_in_words(vehicle: Vehicle, latency: Latency) -> str:
+    """Return the line about what is late, by name where the delays differ."""
+    parts = []
+    for kind, names, delays in (
+        ("sensors", vehicle.state_names, latency.sensors),
+        ("controls", [c.name for c in vehicle.controls], latency.controls),
+    ):
+        if len(set(delays)) == 1:
+            parts.append(f"{kind} {delays[0]:g} s")
+        else:
+            late = zip(names, delays, strict=True)
+            parts.extend(f"{name} {delay:g} s" for name, delay in late)
+    return f"latency, compensated: {', '.join(parts)}"
 
 
 def _certified_box(certificate: DrivingCertificate, trained: TrainedModel) -> str:
@@ -108,12 +141,24 @@ def _certified_facts(
     kept = f"{100 * coverage.share:.1f} % of {coverage.runs} runs"
     yield f"{measured}, corridor {width}, kept in {kept}"
     yield _corridor_conditions(corridor.conditions, env_names)
+    if corridor.margins:
+        yield _margins_in_words(corridor.margins)
     if recorded := corridor.recorded:
         number = recorded.conditions.runs
         width = f"{recorded.corridor_m:.3f} m"
         yield f"of {number} runs of the car: {width} at level {recorded.level:g}"
     elif not corridor.is_claimed:
         yield "of a model of logs, not of the car, about which nothing is claimed"
+
+
+def _margins_in_words(margins: LawMargins) -> str:
+    """Return the line about what the law tolerates."""
+    delay = min(margins.delay_s)
+    at = margins.speed[margins.delay_s.index(delay)]
+    return (
+        f"law, on a grid: stable up to {delay:.2f} s later (at {at:.3g} m/s), with "
+        f"{max(margins.gain_low):.2g} to {min(margins.gain_high):.2g} times its gains"
+    )
 
 
 def _corridor_conditions(conditions: Conditions, env_names: list[str]) -> str:

@@ -14,13 +14,13 @@ from sfkd_jax.certification._measured import coverage_interval
 from sfkd_jax.driving import drives
 from sfkd_jax.driving.certificate import Bounds, DrivingCertificate
 from sfkd_jax.driving.corridor import verify_driving
-from sfkd_jax.driving.corridor._alarms import closed_loop
 from sfkd_jax.driving.corridor._bounds import (
     ALONE,
     JOINT,
     calibrate_corridor,
     corridor_coverage,
 )
+from sfkd_jax.driving.corridor._closed_loop import closed_loop
 from sfkd_jax.driving.corridor._measuring import measure_corridor
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.driving.plants import kinematic

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from sfkd_jax.certificate import Box, Coverage, Matrix
+from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.ranges import (
     AtLeastOne,
     Fraction,
@@ -39,6 +40,7 @@ class Conditions:
         law_model: the model that the law was derived from.
         identified_from: hash of the logs if the runs are of a model of logs; None if
             they are of the vehicle.
+        latency: of the sensors and the controls, which the law compensated.
     """
 
     speed: Span
@@ -57,6 +59,7 @@ class Conditions:
     perturbation: tuple[NonNegative, ...]
     law_model: str
     identified_from: str | None = None
+    latency: Latency = NO_LATENCY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,6 +194,29 @@ class Recorded:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LawMargins:
+    """What the law tolerates at some speeds; the least over turns and environments.
+
+    Measured on linearisations of the plant at a grid of steady turns.
+
+    Attributes:
+        speed: v_ref [m/s], ascending.
+        delay_s: by which commands may act later than assumed [s].
+        gain_low: smallest factor of the gains.
+        gain_high: largest factor of the gains.
+        noise_lateral_m: standard deviation of e_y that the sensors cause [m].
+        noise_steering: that of the steering [rad].
+    """
+
+    speed: tuple[NonNegative, ...]
+    delay_s: tuple[NonNegative, ...]
+    gain_low: tuple[NonNegative, ...]
+    gain_high: tuple[NonNegative, ...]
+    noise_lateral_m: tuple[NonNegative, ...]
+    noise_steering: tuple[NonNegative, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Corridor:
     """How far the vehicle stays from its path, whatever a planner behind a shield does.
 
@@ -210,6 +236,7 @@ class Corridor:
         shield_horizon: preview of the shield [steps].
         seconds: that the measurements took [s].
         recorded: corridor of recorded runs of the car, or None.
+        margins: of the law; None in certificates from before they were measured.
     """
 
     conditions: Conditions
@@ -227,6 +254,7 @@ class Corridor:
     shield_horizon: AtLeastOne
     seconds: NonNegative
     recorded: Recorded | None = None
+    margins: LawMargins | None = None
 
     @property
     def is_claimed(self) -> bool:

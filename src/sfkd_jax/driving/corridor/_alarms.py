@@ -1,13 +1,13 @@
-"""A closed loop with noisy sensors, and the calibration of the test of innovations.
+"""The nominal model of a loop, and the calibration of the test of innovations.
 
 The test raises an alarm when a vehicle or its sensors are not those of the calibration.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,32 +16,16 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.certification import alarm_thresholds, rows
 from sfkd_jax.driving.certificate import Innovations
-from sfkd_jax.driving.drives import sensor_keys
-from sfkd_jax.driving.path_coordinates import (
-    CURVATURE,
-    HEADING,
-    LATERAL,
-    PERTURBATION,
-    REFERENCE_SPEED,
-)
+from sfkd_jax.driving.corridor._closed_loop import Loop, predicted_spread
+from sfkd_jax.driving.drives import Reading
+from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
 from sfkd_jax.driving.path_following import (
     InnovationTest,
-    PathLaw,
     expected_coordinates,
     turning_rate,
 )
-from sfkd_jax.driving.plants import Vehicle, along_path
-from sfkd_jax.rollout import fold, on_host, rollout
-from sfkd_jax.types import (
-    BODY,
-    Control,
-    Environment,
-    Key,
-    Model,
-    Params,
-    State,
-    Trajectory,
-)
+from sfkd_jax.rollout import rollout
+from sfkd_jax.types import BODY, Environment, Key, State, Trajectory
 
 BATCHES = 10
 """Number of times that all runs are simulated for the calibration. Half of these
@@ -61,98 +45,6 @@ Observed: TypeAlias = tuple[Float[Array, "run gap chart"], Float[Array, "run gap
 """Innovations and levels of the law at every step between two rows of runs."""
 
 
-class Loop(NamedTuple):
-    """The closed loop of plant and law, and the model of the policy.
-
-    Attributes:
-        plant: the true plant with the law around it.
-        law: of the policy.
-        model: of the policy.
-        params: of the model, folded.
-        noise: standard deviations of the sensors, one per state of the vehicle.
-    """
-
-    plant: Vehicle
-    law: PathLaw
-    model: Model
-    params: Params
-    noise: tuple[float, ...]
-
-
-def closed_loop(
-    plant: Vehicle,
-    model: Model,
-    params: Params,
-    law: PathLaw | None,
-    noise: Sequence[float],
-) -> Loop:
-    """Return the closed loop of a plant and the parts of a policy.
-
-    Args:
-        plant: the vehicle without a law.
-        model: of the policy.
-        params: of the model; they are folded here.
-        law: of the policy.
-        noise: standard deviations of the sensors, one per state of the vehicle.
-
-    Raises:
-        ValueError: the policy has no law.
-    """
-    if law is None:
-        raise ValueError(
-            "a corridor needs a policy in path coordinates, with its law: "
-            "model.frame=path"
-        )
-    return Loop(
-        plant=along_path(plant, law, perturbation=law.perturbation),
-        law=law,
-        model=model,
-        params=fold(model, params, on_host),
-        noise=tuple(noise),
-    )
-
-
-def sensor_effect(
-    loop: Loop, key: Key, state: State, inputs: Control, env: Environment
-) -> Array:
-    """Return the perturbation of ν that the noise of the sensors amounts to.
-
-    The law is a known function. If it reads ξ + n in place of ξ, its control changes as
-    if ν were perturbed.
-
-    Args:
-        loop: whose law reads the sensors.
-        key: of the noise; consumed.
-        state: true path state.
-        inputs: w = (ν, κ, v_ref).
-        env: e.
-    """
-    coordinates = state[BODY]
-    curvature = inputs[CURVATURE]
-    reference_speed = inputs[REFERENCE_SPEED]
-    spread = spread_of(loop.noise, state.shape[-1])[BODY]
-    measured = coordinates + spread * jax.random.normal(key, coordinates.shape)
-    turn = loop.law.turn(curvature, reference_speed, env)
-    return turn.feedback(measured) - turn.feedback(coordinates)
-
-
-def spread_of(noise: tuple[float, ...], size: int) -> Array:
-    """Return the standard deviations of a path state from those of the sensors.
-
-    The deviation of e_y is that of a position, and the one of e_ψ is that of the yaw.
-    The other coordinates are states of the vehicle and keep their deviations. The pose
-    of a path state is exact.
-
-    Args:
-        noise: standard deviations of (p_x, p_y, yaw, v, …).
-        size: of the path state.
-    """
-    # Without p_x: p_y, yaw, v, … are the deviations of ξ = (e_y, e_ψ, v, …).
-    of_coordinates = noise[1 : size - 2]
-    stop = BODY.start + len(of_coordinates)
-    return jnp.zeros(size).at[BODY.start : stop].set(jnp.asarray(of_coordinates))
-
-
 def simulate_nominal(
     loop: Loop, runs: Trajectory, key: Key
 ) -> tuple[Float[Array, "run time"], Float[Array, "run rank"]]:
@@ -167,13 +59,13 @@ def simulate_nominal(
         key: of the measurements; consumed.
     """
     model = loop.model
-    spread = spread_of(loop.noise, runs.states.shape[-1])
 
     def lateral(run: Trajectory) -> Array:
         return rollout(model, loop.params, run).free[:, BODY][:, LATERAL]
 
     def gap(state: State, env: Environment, key: Key) -> Array:
         fiber = model.fiber(loop.params, env)
+        spread = predicted_spread(loop, state)
         measured = state + spread * jax.random.normal(key, state.shape)
         from_measured = model.vector(model.encode(fiber, measured))
         from_true = model.vector(model.encode(fiber, state))
@@ -184,42 +76,31 @@ def simulate_nominal(
     return jax.vmap(lateral)(runs), gaps
 
 
-def innovations(loop: Loop, runs: Trajectory, key: Key) -> Observed:
-    """Return innovations and levels of runs, with the noise that their law has read.
+def innovations(loop: Loop, readings: Reading) -> Observed:
+    """Return innovations and levels of runs, as a gate computes them while driving.
 
     Args:
         loop: that drove the runs.
-        runs: of the loop.
-        key: with which the runs were made. Its first half drew the environments, its
-            second half everything else, the noise of the sensors included.
+        readings: of its law, (run, time, …).
     """
     model = loop.model
     law = loop.law
-    _, run_key = jax.random.split(key)
-    keys = sensor_keys(run_key, *runs.controls.shape[:2])
-    spread = spread_of(loop.noise, runs.states.shape[-1])[BODY]
-    noise = jax.vmap(jax.vmap(partial(jax.random.normal, shape=spread.shape)))(keys)
 
-    def step(
-        before: Array, after: Array, inputs: Array, env: Array
-    ) -> tuple[Array, Array]:
-        """Return innovation and level from measured ξ before and after a step."""
-        fiber = model.fiber(loop.params, env)
-        nu = inputs[PERTURBATION]
-        road = inputs[PERTURBATION.stop :]
-        # The law has read the measured ξ, as this prediction does. The noise is
-        # therefore in both of their controls, and cancels.
+    def step(reading: Reading, after: Array) -> tuple[Array, Array]:
+        """Return innovation and level from a reading and the next measured ξ."""
+        before = reading.measured
+        road = reading.road
+        fiber = model.fiber(loop.params, reading.env)
+        turn = law.turn(road[0], road[1], reading.env)
+        nu = reading.control - turn.feedback(before)
         expected = expected_coordinates(model, fiber, before, nu, road)
-        turn = law.turn(road[0], road[1], env)
-        control = turn.feedback(before) + nu
-        turned = loop.plant.dt * turning_rate(law, before, control, road, env)
+        rate = turning_rate(law, before, reading.control, road, reading.env)
+        turned = loop.plant.dt * rate
         innovation = jnp.append(after - expected, (after - before)[HEADING] - turned)
         return innovation, turn.level
 
-    measured = runs.states[:, :-1, BODY] + spread * noise
-    return jax.vmap(jax.vmap(step))(
-        measured[:, :-1], measured[:, 1:], runs.controls[:, :-1], runs.envs[:, :-1]
-    )
+    first = jax.tree.map(lambda leaf: leaf[:, :-1], readings)
+    return jax.vmap(jax.vmap(step))(first, readings.measured[:, 1:])
 
 
 @jax.jit

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -38,10 +38,8 @@ from sfkd_jax.driving.certificate import (
     Seen,
 )
 from sfkd_jax.driving.corridor._alarms import (
-    Loop,
     calibrate_innovations,
     innovations,
-    sensor_effect,
     simulate_nominal,
 )
 from sfkd_jax.driving.corridor._bounds import (
@@ -50,8 +48,10 @@ from sfkd_jax.driving.corridor._bounds import (
     calibrate_corridor,
     corridor_coverage,
 )
+from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
+from sfkd_jax.driving.corridor._margins import law_margins
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
-from sfkd_jax.driving.drives import drive_along_path, from_s3
+from sfkd_jax.driving.drives import Reading, drive_along_path, from_s3
 from sfkd_jax.driving.path_coordinates import LATERAL
 from sfkd_jax.driving.scenarios import DRIVES, DriveClass, random_switching
 from sfkd_jax.ranges import Interval, Span
@@ -67,6 +67,8 @@ uses the streams 0 to 2.
 """
 ALARM_STREAM = 5
 """The same for the test of innovations."""
+Driver: TypeAlias = Callable[[Key], tuple[Trajectory, Reading | None]]
+"""key -> runs, and what the law has read on them."""
 
 
 def measure_corridor(
@@ -114,7 +116,7 @@ def measure_corridor(
     drivers = (drive, drive, drive, drive_s3)
     sensor_keys = jax.random.split(sensor_key, len(drivers))
     units, calibration, test, s3 = (
-        _measure(loop, claims, simulate, driver(run_key), key)
+        _measure(loop, claims, simulate, driver(run_key)[0], key)
         for driver, run_key, key in zip(drivers, run_keys, sensor_keys, strict=True)
     )
     bounds, groups = _bounds_of_groups(
@@ -144,6 +146,7 @@ def measure_corridor(
         innovations=alarms,
         failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
         shield_horizon=horizon,
+        margins=law_margins(loop, data),
         seconds=time.perf_counter() - began,
     )
 
@@ -171,6 +174,7 @@ def _conditions(
         perturbation=rows(np.asarray(loop.law.perturbation)),
         law_model=data["law"]["model"],
         identified_from=identified_from,
+        latency=loop.latency,
     )
 
 
@@ -180,8 +184,8 @@ def _drivers(
     runs: int,
     duration: float,
     dwell: tuple[float, float],
-) -> tuple[Callable[[Key], Trajectory], Callable[[Key], Trajectory]]:
-    """Return key -> runs under the conditions, and key -> runs of S3; compiled.
+) -> tuple[Driver, Driver]:
+    """Return drivers under the conditions, and on S3; compiled.
 
     Each makes `runs` runs of every group, group after group.
     """
@@ -202,19 +206,19 @@ def _driver(
     data: Mapping[str, Any],
     groups: Int[Array, " run"],
     conditions: Callable[[Key], Array],
-) -> Callable[[Key], Trajectory]:
+) -> Driver:
     """Return key -> runs of the groups, each in an environment of its own; compiled."""
     drive = partial(
         drive_along_path,
         loop.plant,
         limits=DriveClass(**drive_class(data)),
-        sensors=partial(sensor_effect, loop),
+        sensors=law_sensors(loop),
         offset=(0.0, 0.0, 0.0),
         burn_in=0,
         **{name: data[name] for name in EXCITATION},
     )
 
-    def driven(key: Key) -> Trajectory:
+    def driven(key: Key) -> tuple[Trajectory, Reading | None]:
         env_key, run_key = jax.random.split(key)
         envs = jax.vmap(conditions)(jax.random.split(env_key, len(groups)))
         return drive(envs, run_key, groups=groups)
@@ -366,8 +370,8 @@ def _measure(
 
 
 def _observed(
-    innovations_of: Callable[[Trajectory, Key], Any],
-    driver: Callable[[Key], Trajectory],
+    innovations_of: Callable[[Reading], Any],
+    driver: Driver,
     key: Key,
 ) -> Any:
     """Return innovations and levels of runs.
@@ -375,13 +379,14 @@ def _observed(
     A run in which a simulator failed is replaced by another run.
 
     Args:
-        innovations_of: runs and their key -> innovations and levels; compiled.
+        innovations_of: readings of the law -> innovations and levels; compiled.
         driver: key -> runs.
         key: of the runs; consumed.
     """
-    runs = driver(key)
+    runs, readings = driver(key)
+    assert readings is not None
     succeeded = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
     count = len(runs.states)
     replacements = np.resize(np.flatnonzero(succeeded), count)
     rows = np.where(succeeded, np.arange(count), replacements)
-    return jax.tree.map(lambda leaf: leaf[rows], innovations_of(runs, key))
+    return jax.tree.map(lambda leaf: leaf[rows], innovations_of(readings))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.certificate import OutputMetric
 from sfkd_jax.certification import CertificateContradicted
 from sfkd_jax.driving.certificate import CorridorAttack
-from sfkd_jax.driving.corridor._alarms import Loop
+from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
 from sfkd_jax.driving.path_coordinates import (
     LATERAL,
     PATH_SPEED,
@@ -188,8 +188,8 @@ def outcome_of(
 ) -> Outcome:
     """Return the outcome of one run of plant and nominal model; callers vmap.
 
-    Both start on the path. The tube of e_y is |e_y − ê_y| ≤ L α R + ε with
-    R⁺ = α R + |d|_P.
+    Both start on the path, and the law reads the plant without noise. The tube of e_y
+    is |e_y − ê_y| ≤ L α R + ε with R⁺ = α R + |d|_P.
 
     Args:
         loop: of plant and law.
@@ -204,10 +204,13 @@ def outcome_of(
     factor = jnp.asarray(np.linalg.cholesky(claim.metric), dtype=float)
     at_rest = jnp.zeros(len(plant.state_names) - BODY.start)
     start = without_pose(at_rest.at[PATH_SPEED].set(run_inputs[0, REFERENCE_SPEED]))
+    sensors = law_sensors(loop, noisy=False)
+    memory = sensors.init(start, run_inputs[0], envs[0])
+    no_noise = jax.random.key(0)
     latent = model.encode(model.fiber(params, envs[0]), start)
 
     def step(carry: Any, at_step: tuple[Array, Environment, Array]) -> tuple[Any, Any]:
-        state, latent, error = carry
+        state, latent, error, memory = carry
         inputs, env, index = at_step
         fiber = model.fiber(params, env)
         # The filter sees the nominal model, as in the controller.
@@ -215,7 +218,8 @@ def outcome_of(
             nu = nu_filter(fiber, latent, inputs[PERTURBATION], index)
             inputs = inputs.at[PERTURBATION].set(nu)
         expected = model.step(fiber, model.encode(fiber, state), inputs)
-        state = plant.step(state, inputs, env)
+        nu, _, memory = sensors.read(memory, no_noise, state, inputs, env)
+        state = plant.step(state, inputs.at[PERTURBATION].set(nu), env)
         latent = model.step(fiber, latent, inputs)
         nominal_state = model.decode(fiber, latent)
         expected_state = model.decode(fiber, expected)
@@ -227,10 +231,11 @@ def outcome_of(
         gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
         error = claim.alpha * error + jnp.linalg.norm(gap @ factor)
         values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
-        return (state, latent, error), values
+        return (state, latent, error, memory), values
 
     steps = (run_inputs, envs, jnp.arange(len(run_inputs)))
-    _, outcomes = jax.lax.scan(step, (start, latent, jnp.zeros(())), steps)
+    carry = (start, latent, jnp.zeros(()), memory)
+    _, outcomes = jax.lax.scan(step, carry, steps)
     return jax.tree.map(jnp.max, outcomes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,13 @@ from sfkd_jax.driving.drives._schedules import (
     planned_segments,
     schedules_along_path,
 )
-from sfkd_jax.driving.path_coordinates import CURVATURE, LATERAL, is_valid
+from sfkd_jax.driving.path_coordinates import (
+    CURVATURE,
+    LATERAL,
+    PERTURBATION,
+    PathState,
+    is_valid,
+)
 from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.driving.scenarios import DRIVES, DriveClass, random_drive
 from sfkd_jax.geometry import without_pose
@@ -25,9 +31,6 @@ from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.rollout import in_batches
 from sfkd_jax.types import BODY, Control, Environment, Key, State, Trajectory
 
-Sensors: TypeAlias = Callable[[Key, State, Control, Environment], Control]
-"""Maps (key, path state, w, e) to what the noise of its sensors makes the law add to ν.
-"""
 Range: TypeAlias = tuple[float, float]
 
 BURN_IN = 20
@@ -38,6 +41,44 @@ of road, ν and start, which `split` makes.
 """
 BANG_BANG_SHARE = 0.25
 """Share of the runs whose ν jumps between its two values."""
+
+
+class Reading(NamedTuple):
+    """What a controller with imperfect sensors knows at a call, and what it does.
+
+    Attributes:
+        measured: ξ that the sensors showed.
+        control: u over the period that begins at the time of this measurement.
+        road: κ [1/m] and v_ref [m/s] of that period.
+        env: e that was known.
+    """
+
+    measured: PathState
+    control: Control
+    road: Float[Array, " 2"]
+    env: Environment
+
+
+class Sensors(NamedTuple):
+    """How a law reads the state of its loop: with noise, and late.
+
+    Attributes:
+        init: (path state, w, e) at the start -> memory.
+        read: (memory, key, path state, w, e) -> (ν with which the exact law would
+            apply the same control, what was read, memory).
+    """
+
+    init: Callable[[State, Control, Environment], Any]
+    read: Callable[
+        [Any, Key, State, Control, Environment], tuple[Control, Reading, Any]
+    ]
+
+
+def _read_exactly(
+    memory: Any, key: Key, state: State, inputs: Control, env: Environment
+) -> tuple[Float[Array, " 2"], None, Any]:
+    """Return ν as it is, and no reading."""
+    return inputs[PERTURBATION], None, memory
 
 
 def generate_along_path(
@@ -83,7 +124,7 @@ def generate_along_path(
         counts = counts_by_scenario(segments, along_path=True)
         planned = planned_segments(env_key, schedules, counts)
     envs = [jax.vmap(conditions)(keys) for conditions, keys in planned]
-    return drive_along_path(
+    runs, _ = drive_along_path(
         loop,
         jnp.concatenate(envs),
         run_key,
@@ -91,6 +132,7 @@ def generate_along_path(
         steering_excitation=steering_excitation,
         speed_excitation=speed_excitation,
     )
+    return runs
 
 
 def drive_along_path(
@@ -105,7 +147,7 @@ def drive_along_path(
     offset: tuple[float, float, float] = (0.1, 0.02, 0.5),
     burn_in: int = BURN_IN,
     sensors: Sensors | None = None,
-) -> Trajectory:
+) -> tuple[Trajectory, Reading | None]:
     """Simulate one run in each of the given environments.
 
     Speed and curvature are those of `random_drive`. ν of a run is an AR(1) process, as
@@ -123,14 +165,19 @@ def drive_along_path(
         speed_excitation: range of the spread of ν_2 [m/s² or m/s].
         offset: largest e_y [m], e_ψ [rad] and v − v_ref [m/s] at the start.
         burn_in: steps simulated before a run starts.
-        sensors: noise of the law's sensors. It is not part of w.
+        sensors: that the law reads; None if it knows the state. What they make it do is
+            not part of w.
+
+    Returns:
+        The runs, and what the law has read at every step, (run, time, …).
     """
+    read = _read_exactly if sensors is None else sensors.read
     spread = jnp.asarray([steering_excitation, speed_excitation])
     drive = partial(random_drive, limits=limits, dt=loop.dt)
     if groups is None:
         groups = jnp.arange(envs.shape[0]) % len(DRIVES)
 
-    def run(inputs: tuple[Array, Key, Array]) -> Trajectory:
+    def run(inputs: tuple[Array, Key, Array]) -> tuple[Trajectory, Reading | None]:
         run_envs, run_key, group = inputs
         # The first environment also holds during the burn-in.
         run_envs = jnp.concatenate(
@@ -138,7 +185,7 @@ def drive_along_path(
         )
         steps = run_envs.shape[0]
         road_key, nu_key, start_key = jax.random.split(run_key, 3)
-        step_keys = _sensor_keys(run_key, steps)
+        step_keys = jax.random.split(jax.random.fold_in(run_key, SENSORS), steps)
         speeds, curvatures = drive(road_key, group, steps=steps)
         nus = _perturbations(nu_key, steps=steps, spread=spread)
         nus = jnp.clip(
@@ -151,38 +198,26 @@ def drive_along_path(
         start = without_pose(jnp.zeros(len(loop.state_names) - 3).at[:3].set(beside))
 
         def step(
-            state: State, inputs: tuple[Control, Environment, Key]
-        ) -> tuple[State, State]:
+            carry: tuple[State, Any], inputs: tuple[Control, Environment, Key]
+        ) -> tuple[Any, Any]:
+            state, memory = carry
             control, env, step_key = inputs
-            if sensors is not None:
-                control = control.at[:2].add(sensors(step_key, state, control, env))
-            after = loop.step(state, control, env)
-            return after, after
+            nu, reading, memory = read(memory, step_key, state, control, env)
+            after = loop.step(state, control.at[PERTURBATION].set(nu), env)
+            return (after, memory), (after, reading)
 
-        _, states = jax.lax.scan(step, start, (controls, run_envs, step_keys))
+        memory = None
+        if sensors is not None:
+            memory = sensors.init(start, controls[0], run_envs[0])
+        _, (states, readings) = jax.lax.scan(
+            step, (start, memory), (controls, run_envs, step_keys)
+        )
         states = jnp.concatenate([start[None], states])
-        return Trajectory(states[burn_in:], controls[burn_in:], run_envs[burn_in:])
+        driven = Trajectory(states, controls, run_envs)
+        return jax.tree.map(lambda leaf: leaf[burn_in:], (driven, readings))
 
     keys = jax.random.split(key, envs.shape[0])
     return in_batches(jax.vmap(run), (envs, keys, groups), size=BATCH)
-
-
-def sensor_keys(key: Key, runs: int, steps: int) -> Array:
-    """Return the keys that `drive_along_path` gives to `sensors`, (run, time).
-
-    With them the noise that a law has read can be drawn again.
-
-    Args:
-        key: that `drive_along_path` was called with.
-        runs: number of its runs.
-        steps: of a run, without a burn-in.
-    """
-    return jax.vmap(partial(_sensor_keys, steps=steps))(jax.random.split(key, runs))
-
-
-def _sensor_keys(key: Key, steps: int) -> Array:
-    """Return a key for the sensors at every step of one run."""
-    return jax.random.split(jax.random.fold_in(key, SENSORS), steps)
 
 
 def _perturbations(

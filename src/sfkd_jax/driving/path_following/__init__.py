@@ -5,6 +5,9 @@ from sfkd_jax.driving.path_following.lanes._in_lane import in_lane as in_lane
 from sfkd_jax.driving.path_following.lanes._judging import Class as Class
 from sfkd_jax.driving.path_following.lanes._manoeuvre import Manoeuvres as Manoeuvres
 from sfkd_jax.driving.path_following.laws._derivation import (
+    by_differences as by_differences,
+)
+from sfkd_jax.driving.path_following.laws._derivation import (
     derive_path_law as derive_path_law,
 )
 from sfkd_jax.driving.path_following.laws._feedback import (
@@ -68,6 +71,14 @@ from sfkd_jax.driving.path_following.wrappers._innovations import (
 )
 from sfkd_jax.driving.path_following.wrappers._innovations import (
     turning_rate as turning_rate,
+)
+from sfkd_jax.driving.path_following.wrappers._prediction import Periods as Periods
+from sfkd_jax.driving.path_following.wrappers._prediction import (
+    Prediction as Prediction,
+)
+from sfkd_jax.driving.path_following.wrappers._prediction import Predictor as Predictor
+from sfkd_jax.driving.path_following.wrappers._prediction import (
+    periods_ahead as periods_ahead,
 )
 from sfkd_jax.driving.path_following.wrappers._safety_filter import (
     FILTER_SCALES as FILTER_SCALES,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.driving.path_coordinates import LATERAL, curvature_ahead, path_coordinates
 from sfkd_jax.driving.paths import project, reference_window
-from sfkd_jax.driving.plants import Vehicle, equivalent_wind
+from sfkd_jax.driving.plants import LateState, Vehicle, equivalent_wind, late_loop
 from sfkd_jax.driving.scenarios import (
     Scenario,
     car_clearance,
@@ -21,8 +21,9 @@ from sfkd_jax.driving.scenarios import (
 )
 from sfkd_jax.driving.simulation.metrics import SIGNALS, Signal
 from sfkd_jax.info import reported
+from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.ranges import Real
-from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
+from sfkd_jax.types import Controller, Key, Params, Reference, Scalar, State, Step
 
 FORCE_STREAM = 2
 """Number that is folded into an episode's key for the random side forces. The streams 0
@@ -64,6 +65,7 @@ def simulate(
     dt: float,
     horizon: int,
     observation_noise: Sequence[float | Scalar] = (),
+    latency: Latency = NO_LATENCY,
     size: tuple[float, float] | None = None,
     record: Mapping[str, Signal] | None = None,
 ) -> Episode:
@@ -88,6 +90,8 @@ def simulate(
         horizon: length of the reference window.
         observation_noise: standard deviation per state. States beyond its length are
             observed without noise; entries beyond the states are not used.
+        latency: of sensors and controls, see `plants.Late`. The reference begins where
+            the vehicle is observed.
         size: length and width of the car [m], which a course needs.
         record: more signals of every step, by name, besides those of the metrics.
 
@@ -99,28 +103,26 @@ def simulate(
     # Sensors have a key of their own, so that two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     recorded = SIGNALS | dict(record or {})
-    levels = jnp.asarray(observation_noise, dtype=float)[: len(scenario.initial_state)]
-    spread = jnp.zeros_like(scenario.initial_state).at[: len(levels)].set(levels)
+    spread = _spread(observation_noise, len(scenario.initial_state))
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
+    late = late_loop(latency, states=len(scenario.initial_state), dt=dt)
 
     def step(
-        carry: tuple[State, Scalar, Any], inputs: tuple[Array, Array, Key]
+        carry: tuple[State, Scalar, Any, LateState], inputs: tuple[Array, Array, Key]
     ) -> tuple[Any, Any]:
-        state, progress, memory = carry
+        state, progress, memory, pending = carry
         env, observed_env, sensor_key = inputs
+        arrived, pending = late.observe(pending, jnp.append(state, progress))
         # Noise reaches the controller alone, and neither plant nor scores.
-        observation = state + spread * jax.random.normal(sensor_key, state.shape)
-        if scenario.course is not None:
-            ahead: Any = scenario.course.lane, in_view(scenario.course, progress)
-        else:
-            ahead = reference_window(
-                scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
-            )
+        noise = spread * jax.random.normal(sensor_key, state.shape)
+        observation = arrived[:-1] + noise
+        ahead = _ahead(scenario, arrived[-1], dt=dt, horizon=horizon)
         control, memory, info = controller.act(
             params, memory, observation, observed_env, ahead
         )
         info = reported(info)
-        state = plant(state, control, env)
+        acting, pending = late.actuate(pending, control)
+        state = plant(state, acting, env)
         # The guess moves on at the reference speed. Where the path crosses itself, the
         # foot point therefore stays on the right branch.
         progress, lateral = project(
@@ -130,17 +132,46 @@ def simulate(
             assert size is not None
             info = info._replace(gap=car_clearance(ahead[1], state, size=size))
             if info.lane is not None:
-                # The first point of the reference is where the car should be now.
-                reference = info.lane.reference
-                curvature = curvature_ahead(reference)[0]
-                lateral = path_coordinates(state, reference[0], curvature)[LATERAL]
+                # The first point is where the car should be now, if nothing is late.
+                lateral = _beside(info.lane.reference[late.observed_ago :], state)
         signals = {name: signal(info) for name, signal in recorded.items()}
-        return (state, progress, memory), (state, control, lateral, progress, signals)
+        carry = (state, progress, memory, pending)
+        return carry, (state, control, lateral, progress, signals)
 
-    start = (scenario.initial_state, jnp.zeros(()), controller.init(planner_key))
+    first = scenario.initial_state
+    pending = late.init(jnp.append(first, 0.0))
+    start = (first, jnp.zeros(()), controller.init(planner_key), pending)
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
-    return Episode(jnp.concatenate([scenario.initial_state[None], states]), *rest)
+    return Episode(jnp.concatenate([first[None], states]), *rest)
+
+
+def _spread(levels: Sequence[float | Scalar], states: int) -> State:
+    """Return the standard deviation of every state; 0 beyond those that are given."""
+    known = jnp.asarray(levels, dtype=float)[:states]
+    return jnp.zeros(states).at[: len(known)].set(known)
+
+
+def _beside(reference: Reference, state: State) -> Scalar:
+    """Return e_y of a state beside the first point of a reference [m]."""
+    curvature = curvature_ahead(reference)[0]
+    return path_coordinates(state, reference[0], curvature)[LATERAL]
+
+
+def _ahead(scenario: Scenario, progress: Scalar, *, dt: float, horizon: int) -> Any:
+    """Return what a controller is shown: a reference, or lane and obstacles.
+
+    Args:
+        scenario: with its path or course.
+        progress: arc length at which the vehicle is observed [m].
+        dt: sampling period [s].
+        horizon: length of the reference.
+    """
+    if scenario.course is not None:
+        return scenario.course.lane, in_view(scenario.course, progress)
+    return reference_window(
+        scenario.path, progress, scenario.speed, dt=dt, horizon=horizon
+    )
 
 
 def observed_environment(

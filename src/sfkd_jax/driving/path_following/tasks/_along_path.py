@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
+from math import ceil
 from typing import Any, NamedTuple
 
 import jax
@@ -40,8 +41,15 @@ from sfkd_jax.driving.path_following.laws._feedback import PathErrors
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
 from sfkd_jax.driving.path_following.tasks._path_tracking import LawTask, check_path
-from sfkd_jax.geometry import between, entrywise, without_pose
+from sfkd_jax.geometry import (
+    between,
+    compose,
+    entrywise,
+    without_pose,
+    wrap_angle,
+)
 from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
+from sfkd_jax.latency import ON_TIME, CommandDelay, delayed, pushed, rows_needed
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
@@ -68,6 +76,8 @@ class Preview(NamedTuple):
             believed.
         observation: in the world, as it came.
         reference: in the world, as it came.
+        sent: the last commands that may still act, newest last; NaN before the first
+            one.
         repeated: whether the observation is bit for bit the last one, like that of a
             sensor that froze.
         measured: which entries of ξ are measured; behind a `Gate` the others are
@@ -81,17 +91,60 @@ class Preview(NamedTuple):
     along: Scalar
     observation: State
     reference: Reference
+    sent: Float[Array, "step control"]
     repeated: Bool[Array, ""]
     measured: Bool[Array, " coordinate"]
     on_time: Bool[Array, ""]
     reason: Int[Array, ""]
 
 
+def later_road(
+    road: Float[Array, "preview 2"], periods: float
+) -> Float[Array, "later 2"]:
+    """Return κ and v_ref some periods later; between two rows, their mean."""
+    whole = ceil(periods)
+    share = whole - periods
+    later = road[whole:]
+    if not share:
+        return later
+    return later + share * (road[whole - 1 : -1] - later)
+
+
+def later_points(
+    points: Float[Array, "preview 4"], periods: float
+) -> Float[Array, "later 4"]:
+    """Return the points of a reference some periods later, between two points."""
+    whole = ceil(periods)
+    share = whole - periods
+    later = points[whole:]
+    if not share:
+        return later
+    gap = points[whole - 1 : -1] - later
+    return later + share * gap.at[:, 2].set(wrap_angle(gap[:, 2]))
+
+
+def state_beside(xi: PathState, preview: Preview) -> State:
+    """Return the state in the world of a vehicle at ξ, beside the reference."""
+    curvature = preview.road[0, 0]
+    along = preview.along
+    left = xi[LATERAL] + 0.5 * curvature * along**2
+    motion = jnp.stack([along, left, xi[HEADING] + curvature * along])
+    pose = compose(preview.reference[0, POSE], motion)
+    return jnp.concatenate([pose, xi[PATH_SPEED:]])
+
+
 class AlongReferenceState(NamedTuple):
-    """State of the wrapped controller, and the last observation in the world."""
+    """What is kept from one control step to the next.
+
+    Attributes:
+        inner: state of the wrapped controller.
+        observations: the last ones in the world, newest last.
+        sent: the last commands that may still act, newest last.
+    """
 
     inner: Any
-    observation: State
+    observations: Float[Array, "time state"]
+    sent: Float[Array, "step control"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,17 +160,26 @@ class AlongReference(Stateful):
     Attributes:
         inner: its `act` takes ξ and a `Preview` in place of observation and reference.
         coordinates: size of ξ.
+        delay: of the commands after the oldest entry of an observation.
+        hold_back: periods by which each entry of an observation is younger than the
+            oldest one. It is used that much later, so that all are of one time.
     """
 
     inner: Controller
     _: KW_ONLY
     coordinates: int
+    delay: CommandDelay = ON_TIME
+    hold_back: tuple[float, ...] = ()
 
     def init(self, key: Key) -> AlongReferenceState:
         """Return the state before the first control step."""
         # NaN equals nothing, so the first observation is never a repetition.
-        unknown = jnp.full(self.coordinates + 1, jnp.nan, dtype=float)
-        return AlongReferenceState(self.inner.init(key), unknown)
+        rows = rows_needed(self.hold_back)
+        return AlongReferenceState(
+            inner=self.inner.init(key),
+            observations=jnp.full((rows, self.coordinates + 1), jnp.nan, dtype=float),
+            sent=jnp.full((self.delay.steps, 2), jnp.nan, dtype=float),
+        )
 
     def act(
         self,
@@ -129,6 +191,9 @@ class AlongReference(Stateful):
     ) -> tuple[Control, AlongReferenceState, ControllerInfo]:
         """Take one control step."""
         precise = check_path(observation, env, reference, reference.shape[0])
+        repeated = jnp.all(observation == state.observations[-1])
+        observations = pushed(state.observations, observation)
+        observation = delayed(observations, self.hold_back)
         points, is_followable = followable(reference)
         curvature = curvature_ahead(points)
         xi = path_coordinates(observation, points[0], curvature[0])
@@ -138,12 +203,12 @@ class AlongReference(Stateful):
         readable = all_finite(points)
         road = jnp.where(readable, road, jnp.nan)
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
-        repeated = jnp.all(observation == state.observation)
         preview = Preview(
             road=road,
             along=between(points[0, POSE], observation[POSE])[0],
             observation=observation,
             reference=reference,
+            sent=state.sent,
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
@@ -157,7 +222,7 @@ class AlongReference(Stateful):
         info = reported(info)
         planned = info.plan.states
         if planned is not None:
-            states = jax.vmap(beside)(planned, points)
+            states = jax.vmap(beside)(planned, later_points(points, self.delay.first))
         else:
             states = reported(info.planner).plan.states
         info = info._replace(plan=info.plan._replace(states=states))
@@ -167,7 +232,8 @@ class AlongReference(Stateful):
             claim=info.claim.under(preview.reason),
             path=PathInfo(xi=seen, inputs=road[0], planned=planned),
         )
-        return control, AlongReferenceState(inner, observation), info
+        sent = pushed(state.sent, control)
+        return control, AlongReferenceState(inner, observations, sent), info
 
 
 along_reference = factory(AlongReference, AlongReference.controller)

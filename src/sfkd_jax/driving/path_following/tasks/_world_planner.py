@@ -7,12 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 
 from sfkd_jax.control import all_finite
-from sfkd_jax.driving.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
-from sfkd_jax.driving.path_following.tasks._along_path import Preview
-from sfkd_jax.geometry import compose
+from sfkd_jax.driving.path_coordinates import PathState
+from sfkd_jax.driving.path_following.tasks._along_path import Preview, state_beside
 from sfkd_jax.info import ControllerInfo, reported
 from sfkd_jax.rollout import Offset
-from sfkd_jax.types import POSE, Control, Controller, Params, State
+from sfkd_jax.types import Control, Controller, Params
 
 
 def in_the_world(planner: Controller) -> Controller:
@@ -32,7 +31,7 @@ def in_the_world(planner: Controller) -> Controller:
         # What an adaptation adds to the model is not that of another planner.
         if isinstance(params, Offset):
             params = params.params
-        believed = _state_of(xi, preview)
+        believed = state_beside(xi, preview)
         seen = jnp.where(jnp.all(preview.measured), preview.observation, believed)
         planned, memory, told = planner.act(
             params, memory, seen, env, preview.reference
@@ -47,13 +46,3 @@ def in_the_world(planner: Controller) -> Controller:
         return planned, memory, ControllerInfo(plan=plan, planner=told)
 
     return Controller(planner.init, act)
-
-
-def _state_of(xi: PathState, preview: Preview) -> State:
-    """Return the state of a vehicle at ξ beside its reference."""
-    curvature = preview.road[0, 0]
-    along = preview.along
-    left = xi[LATERAL] + 0.5 * curvature * along**2
-    motion = jnp.stack([along, left, xi[HEADING] + curvature * along])
-    pose = compose(preview.reference[0, POSE], motion)
-    return jnp.concatenate([pose, xi[PATH_SPEED:]])

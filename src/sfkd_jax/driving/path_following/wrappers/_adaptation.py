@@ -30,6 +30,7 @@ from sfkd_jax.driving.path_following.wrappers._estimator import (
 from sfkd_jax.driving.path_following.wrappers._innovations import expected_coordinates
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import AdaptationInfo, ControllerInfo, reported
+from sfkd_jax.latency import ON_TIME, CommandDelay
 from sfkd_jax.ranges import (
     AtLeastTwo,
     Fraction,
@@ -93,6 +94,7 @@ class Adaptation(Stateful):
         env_high: upper end of E; the box of the wind is symmetric.
         estimate_env: whether e is estimated as well; the `env` argument of `act` is
             then not read.
+        delay: of the commands after an observation.
         power: exponent of the second entry of e in its side force: 2 of a wind, 1 of a
             force.
         jump: probability that the force jumps between two steps.
@@ -126,6 +128,7 @@ class Adaptation(Stateful):
     env_low: tuple[float, ...]
     env_high: tuple[float, ...]
     estimate_env: bool = False
+    delay: CommandDelay = ON_TIME
     power: Positive = 2.0
     jump: Fraction = 0.03
     jump_size: Positive = 0.8
@@ -221,8 +224,12 @@ class Adaptation(Stateful):
         inside, excess = loop.split_force(env, side_force(causes, road))
         estimate = belief.bank.mean()[:size]
         offset = _compensation(loop, params, inside, road, estimate, excess)
-        control, inner, info = self.inner.act(offset, state.inner, xi, inside, preview)
-        control = control + offset.inputs[:2] - input_error(causes, road)
+        error = input_error(causes, road)
+        # The controller inside knows its commands without the corrections below.
+        sent = preview.sent - offset.inputs[:2] + error
+        shown = preview._replace(sent=sent)
+        control, inner, info = self.inner.act(offset, state.inner, xi, inside, shown)
+        control = control + offset.inputs[:2] - error
         control = jnp.clip(
             control, jnp.asarray(self.control_low), jnp.asarray(self.control_high)
         )
@@ -234,7 +241,8 @@ class Adaptation(Stateful):
             rejected=rejected,
             adapting=adapting,
         )
-        belief = belief._replace(applied=Applied(control, road, env))
+        acting = self.delay.acting(preview.sent, control)
+        belief = belief._replace(applied=Applied(acting, road, env))
         info = reported(info)._replace(adaptation=adaptation)
         return control, AdaptiveState(inner, belief), info
 

@@ -38,6 +38,7 @@ from sfkd_jax.driving.path_following.wrappers._plausibility import (
 )
 from sfkd_jax.geometry import put
 from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first, reported
+from sfkd_jax.latency import ON_TIME, CommandDelay
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
@@ -146,6 +147,7 @@ class Gate(Stateful):
         horizon: number of steps of the preview.
         reads_env: whether `inner` reads the environment that it is given.
         test: of the innovations; it takes into account what `inner` estimates.
+        delay: of the commands after an observation.
         patience: longest time on the nominal model [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
@@ -161,6 +163,7 @@ class Gate(Stateful):
     conditions: Conditions = ANYWHERE
     reads_env: bool = True
     test: InnovationTest | None = None
+    delay: CommandDelay = ON_TIME
     patience: Positive = 2.0
     trial: Positive = 10.0
     share: Positive = 0.55
@@ -219,8 +222,9 @@ class Gate(Stateful):
             params, state.inner, believed.xi, inputs.env, shown
         )
         info = reported(info)
+        acting = self.delay.acting(preview.sent, control)
         expected = self._expect(
-            params, inputs, believed, road, control, info, tested.state
+            params, inputs, believed, road, acting, info, tested.state
         )
         innovation = difference(inputs.xi, state.expected)
         info = info._replace(
@@ -318,7 +322,7 @@ class Gate(Stateful):
             inputs: of this step.
             believed: of the measurement.
             road: that the controller was shown.
-            control: that is applied.
+            control: that acts over the period after the measurement.
             info: of the controller; an estimator says in it what it estimates.
             test: state of the test of the innovations; None without one.
         """

@@ -1,0 +1,99 @@
+"""Controllers in lanes from a certified policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sfkd_jax.assembly._controller_settings import PLANNERS
+from sfkd_jax.assembly._corridor import conditions_of, corridor_of
+from sfkd_jax.driving import path_following, plants
+from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.path_coordinates import (
+    CURVATURE,
+    HEADING,
+    PATH_SPEED,
+    REFERENCE_SPEED,
+)
+from sfkd_jax.types import Controller
+
+REFERENCE_SEARCH = {
+    "horizon": 1,
+    "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0),
+    "noise": "white",
+}
+"""Settings of every planner that searches for a reference in a lane."""
+REFERENCE_PLANNERS: dict[str, Any] = {
+    "mppi": {"num_samples": 300, "effective_samples": 5.0},
+    "cem": {"num_samples": 100, "iterations": 3, "elites": 10},
+}
+"""Further settings of such a planner, by its name."""
+
+
+def build_in_lane(
+    inner: Controller,
+    plant: plants.Vehicle,
+    law: path_following.PathLaw,
+    certificate: DrivingCertificate,
+    *,
+    horizon: int,
+    car: tuple[float, float],
+    planner: str,
+    friction: int | None,
+) -> Controller:
+    """Return a controller that drives in a lane, see `path_following.InLane`.
+
+    Args:
+        inner: the shielded controller of references.
+        plant: vehicle.
+        law: around which the model was learned.
+        certificate: with a corridor, whose class the references keep.
+        horizon: how many steps of the reference `inner` reads.
+        car: length and width [m].
+        planner: that searches for a reference, in `PLANNERS`.
+        friction: entry of e that is the friction; None if none is.
+    """
+    admissible = _admissible_references(plant, law, certificate, car)
+    manoeuvres = path_following.Manoeuvres(kind=admissible, dt=plant.dt)
+    options = {**REFERENCE_SEARCH, **REFERENCE_PLANNERS.get(planner, {})}
+    speed_gain = float(np.mean(law.gain[..., 1, PATH_SPEED]))
+    return path_following.in_lane(
+        inner=inner,
+        planner=PLANNERS[planner](manoeuvres.task(), **options),
+        manoeuvres=manoeuvres,
+        horizon=horizon,
+        lead=0.0 if plant.speed_loop else 1.0 / speed_gain,
+        friction=friction,
+        lowest=certificate.measured.boxes.env[0][friction or 0],
+    )
+
+
+def _admissible_references(
+    plant: plants.Vehicle,
+    law: path_following.PathLaw,
+    certificate: DrivingCertificate,
+    car: tuple[float, float],
+) -> path_following.Class:
+    """Return the class of references of which a corridor was certified."""
+    corridor = corridor_of(certificate)
+    conditions = corridor.conditions
+    road_low, road_high = certificate.measured.boxes.control
+    state_box = conditions_of(certificate).state
+    heading = 0.0
+    if state_box is not None:
+        heading = max(abs(end[HEADING]) for end in state_box)
+    return path_following.Class(
+        curvature=min(conditions.peak_curvature, road_high[CURVATURE]),
+        turning=conditions.curvature_slope,
+        lateral=min(conditions.lateral_acceleration, float(law.high[0])),
+        jerk=conditions.lateral_jerk,
+        speed=(road_low[REFERENCE_SPEED], road_high[REFERENCE_SPEED]),
+        half=(0.5 * car[0], 0.5 * car[1]),
+        corridor=corridor.corridor_m,
+        heading=heading,
+        change=conditions.acceleration,
+        # The rest is left for what the speed lags behind.
+        deceleration=0.75 * conditions.acceleration,
+        braking=6.0 if plant.speed_loop else -plant.control_low[1],
+    )

@@ -1,0 +1,204 @@
+"""Prediction from the time of an observation to the time at which a command acts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sfkd_jax.control import Stateful, all_finite
+from sfkd_jax.driving.path_coordinates import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    PathState,
+)
+from sfkd_jax.driving.path_following.laws._path_law import PathLaw
+from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
+from sfkd_jax.driving.path_following.tasks._along_path import (
+    Preview,
+    later_points,
+    later_road,
+    state_beside,
+)
+from sfkd_jax.driving.path_following.wrappers._conditions import ANYWHERE, Conditions
+from sfkd_jax.driving.path_following.wrappers._innovations import expected_coordinates
+from sfkd_jax.driving.path_following.wrappers._plausibility import difference
+from sfkd_jax.geometry import put
+from sfkd_jax.latency import CommandDelay
+from sfkd_jax.rollout import fold
+from sfkd_jax.types import (
+    Control,
+    Controller,
+    Environment,
+    Fiber,
+    Key,
+    Model,
+    Params,
+    Scalar,
+)
+
+
+class Periods(NamedTuple):
+    """What acts over the periods of a prediction.
+
+    Attributes:
+        road: κ [1/m] and v_ref [m/s].
+        control: u; NaN where it is unknown, as before the first command.
+        share: of the period that is predicted; the last period may be a part of one.
+    """
+
+    road: Float[Array, "period 2"]
+    control: Float[Array, "period control"]
+    share: Float[Array, " period"]
+
+
+def periods_ahead(
+    delay: CommandDelay,
+    road: Float[Array, "preview 2"],
+    sent: Float[Array, "step control"],
+) -> Periods:
+    """Return the periods from an observation until the first control acts.
+
+    Args:
+        delay: of the commands.
+        road: from the observation on.
+        sent: the commands that may still act, newest last.
+    """
+    count = ceil(delay.first)
+    # A control that acts before the first one is held: its next command is not known.
+    controls = [delay.acting(sent, sent[-1], period) for period in range(count)]
+    share = np.clip(delay.first - np.arange(count), 0.0, 1.0)
+    return Periods(road[:count], jnp.stack(controls), jnp.asarray(share, dtype=float))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """The nominal model of a closed loop, step by step, under given commands.
+
+    Attributes:
+        model: of the closed loop, in path coordinates.
+        law: around which the model was learned.
+        dt: sampling period [s].
+        conditions: where the model predicts. Outside, a vehicle turns as its steering
+            does on a steady turn of the law, and keeps its speed.
+    """
+
+    model: Model
+    law: PathLaw
+    dt: float
+    conditions: Conditions = ANYWHERE
+
+    def ahead(
+        self, fiber: Fiber, env: Environment, xi: PathState, periods: Periods
+    ) -> tuple[PathState, Scalar]:
+        """Return ξ after the periods, and the distance along the path [m].
+
+        Args:
+            fiber: of the model.
+            env: e, inside its box.
+            xi: at the beginning.
+            periods: what acts.
+        """
+
+        def advance(xi: PathState, period: Periods) -> tuple[PathState, Scalar]:
+            turn = self.law.turn(period.road[0], period.road[1], env)
+            feedback = turn.feedback(xi)
+            control = jnp.where(jnp.isnan(period.control), feedback, period.control)
+            after = expected_coordinates(
+                self.model, fiber, xi, control - feedback, period.road
+            )
+            along = self.dt * _progress(xi, period.road)
+            coasting = self._turning(turn, xi, control, period.road, along)
+            inside = self.conditions.hold(xi, period.road) & all_finite(after)
+            step = difference(jnp.where(inside, after, coasting), xi)
+            return xi + period.share * step, period.share * along
+
+        xi, distances = jax.lax.scan(advance, xi, periods)
+        return xi, jnp.sum(distances)
+
+    def _turning(
+        self,
+        turn: SteadyTurn,
+        xi: PathState,
+        control: Control,
+        road: Float[Array, " 2"],
+        along: Scalar,
+    ) -> PathState:
+        """Return ξ one step later of a vehicle that keeps its speed and curvature."""
+        bend = turn.grip[0]
+        turned = self.dt * xi[PATH_SPEED] * control[0] / bend - road[0] * along
+        middle = xi[HEADING] + 0.5 * turned
+        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(middle)
+        after = put(xi, LATERAL, xi[LATERAL] + sideways)
+        return put(after, HEADING, xi[HEADING] + turned)
+
+
+def _progress(xi: PathState, road: Float[Array, " 2"]) -> Scalar:
+    """Return ds/dt = v cos e_ψ / (1 − κ e_y) [m/s]."""
+    scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], 0.2)
+    return xi[PATH_SPEED] * jnp.cos(xi[HEADING]) / scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predictor(Stateful):
+    """A controller along a path that acts on the state at which its command will act.
+
+        ξ̂(t + d) = F(… F(ξ(t); u_{-n}) …; u_{-1})
+
+    The commands that were sent since the observation are known, so the model predicts
+    what they do. The controller inside sees ξ̂ and the road from there on, as if nothing
+    were late. It has no state of its own.
+
+    Attributes:
+        inner: controller along a path.
+        prediction: of the closed loop.
+        delay: of the commands after an observation.
+
+    Source: Smith (1957); Bekiaris-Liberis and Krstic (2013).
+    """
+
+    inner: Controller
+    prediction: Prediction
+    delay: CommandDelay
+
+    def init(self, key: Key) -> Any:
+        """Return the state before the first control step."""
+        return self.inner.init(key)
+
+    def act(
+        self,
+        params: Params,
+        state: Any,
+        xi: PathState,
+        env: Environment,
+        preview: Preview,
+    ) -> tuple[Control, Any, Any]:
+        """Take one control step."""
+        predict = self.prediction
+        nearest = predict.conditions.nearest(env)
+        fiber = predict.model.fiber(fold(predict.model, params), nearest)
+        periods = periods_ahead(self.delay, preview.road, preview.sent)
+        ahead, distance = predict.ahead(fiber, nearest, xi, periods)
+        first = self.delay.first
+        reference = later_points(preview.reference, first)
+        passed = _way(preview.reference, first)
+        shown = preview._replace(
+            road=later_road(preview.road, first),
+            reference=reference,
+            along=preview.along + distance - passed,
+        )
+        shown = shown._replace(observation=state_beside(ahead, shown))
+        return self.inner.act(params, state, ahead, env, shown)
+
+
+def _way(points: Float[Array, "horizon 4"], periods: float) -> Scalar:
+    """Return the distance from the first point to the one some periods later [m]."""
+    gaps = jnp.diff(points[:, :2], axis=0)[: ceil(periods)]
+    share = np.clip(periods - np.arange(len(gaps)), 0.0, 1.0)
+    return jnp.sum(share * jnp.hypot(gaps[:, 0], gaps[:, 1]))

@@ -1,0 +1,190 @@
+"""Latency: how old an observation is when it arrives, and when a command acts.
+
+At call k a controller receives an observation of the time k − d_s, and returns a
+command that acts from k + d_u on, for one sampling period. Delays are constant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+from typing import Annotated, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sfkd_jax.geometry import along_arc
+from sfkd_jax.ranges import Interval, MayBeEmpty, check_intervals
+from sfkd_jax.types import BODY, POSE, Control, State
+
+Delay = Annotated[float, Interval("[0, 2]")]
+"""A delay [s]."""
+Delays: TypeAlias = Annotated[tuple[Delay, ...], MayBeEmpty()]
+"""Delays [s] of several variables; one number stands for all of them, () for none."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The delays of a system.
+
+    Attributes:
+        sensors: from a state to the call of the controller that receives it [s], one
+            for each entry of the observation.
+        controls: from a call of the controller to the effect of its command [s], one
+            for each control.
+
+    Raises:
+        ValueError: a delay is negative, longer than 2 s, or not finite.
+    """
+
+    sensors: Delays = ()
+    controls: Delays = ()
+
+    def __post_init__(self) -> None:
+        check_intervals(self)
+
+    def sized(self, states: int, controls: int) -> Latency:
+        """Return the same delays, one for each variable.
+
+        Raises:
+            ValueError: there are neither as many delays as variables, nor one or none.
+        """
+        return Latency(
+            _one_each("sensors", self.sensors, states),
+            _one_each("controls", self.controls, controls),
+        )
+
+    @property
+    def is_none(self) -> bool:
+        """Whether nothing is late."""
+        return not any((*self.sensors, *self.controls))
+
+    def hold_back(self, dt: float) -> tuple[float, ...]:
+        """Return by how many periods each measured entry is younger than the oldest."""
+        oldest = max(self.sensors, default=0.0)
+        return tuple(_periods(oldest - delay, dt) for delay in self.sensors)
+
+    def observation(self, dt: float) -> tuple[float, ...]:
+        """Return the delays of the sensors, in sampling periods."""
+        return tuple(_periods(delay, dt) for delay in self.sensors)
+
+    def actuators(self, dt: float) -> CommandDelay:
+        """Return the delays of the commands after the call that returns them."""
+        return CommandDelay(tuple(_periods(delay, dt) for delay in self.controls))
+
+    def loop(self, dt: float) -> CommandDelay:
+        """Return the delays of the commands after the oldest entry of an observation.
+
+        A controller that holds the younger entries back sees states of that one time.
+        """
+        oldest = max(self.sensors, default=0.0)
+        delays = tuple(_periods(oldest + delay, dt) for delay in self.controls)
+        return CommandDelay(delays)
+
+
+NO_LATENCY = Latency()
+"""Of a system that is always on time."""
+
+
+@dataclass(frozen=True)
+class CommandDelay:
+    """When commands act, counted from the time of an observation.
+
+    Attributes:
+        periods: delay of every control, in sampling periods. () stands for none.
+    """
+
+    periods: tuple[float, ...] = ()
+
+    @property
+    def steps(self) -> int:
+        """Number of earlier commands that still act after an observation."""
+        return ceil(max(self.periods, default=0.0))
+
+    @property
+    def first(self) -> float:
+        """Periods until the first control acts, to which a controller predicts."""
+        return self.periods[0] if self.periods else 0.0
+
+    def acting(
+        self, sent: Float[Array, "step control"], control: Control, period: int = 0
+    ) -> Control:
+        """Return the mean command over a period after an observation.
+
+        Args:
+            sent: the last `steps` commands before this one, newest last; NaN stands for
+                the command of this call.
+            control: the command of this call, which also stands for later ones.
+            period: 0 for the period that begins at the observation, and so on.
+        """
+        if not self.steps:
+            return control
+        known = jnp.where(jnp.isnan(sent), control, sent)
+        commands = jnp.concatenate([known, control[None]])
+        return jnp.sum(self._shares(period) * commands, axis=0)
+
+    def _shares(self, period: int) -> Float[np.ndarray, "command control"]:
+        """Return the shares of a period during which each command acts."""
+        starts = np.arange(-self.steps, 1)[:, None] + np.asarray(self.periods)
+        ends = np.append(starts[1:], np.full((1, starts.shape[1]), np.inf), axis=0)
+        overlap = np.minimum(ends, period + 1) - np.maximum(starts, period)
+        return np.maximum(overlap, 0.0)
+
+
+ON_TIME = CommandDelay()
+"""Of commands that act at once."""
+
+
+def delayed(
+    past: Float[Array, "time state"], periods: tuple[float, ...]
+) -> Float[Array, " state"]:
+    """Return each entry of a state as it was some periods ago.
+
+    Between two periods the pose is on the arc that joins its values, and the other
+    entries are interpolated linearly.
+
+    Args:
+        past: states at the last periods, newest last; at least as many as are needed.
+        periods: delay of each entry, in sampling periods; () for none.
+    """
+    if not any(periods):
+        return past[-1]
+
+    def at(delay: float) -> State:
+        whole = ceil(delay)
+        share = whole - delay
+        before = past[-1 - whole]
+        after = past[min(-whole, -1)]
+        pose = along_arc(before[POSE], after[POSE], share)
+        body = before[BODY] + share * (after[BODY] - before[BODY])
+        return jnp.concatenate([pose, body])
+
+    times = {delay: at(delay) for delay in set(periods)}
+    return jnp.stack([times[delay][i] for i, delay in enumerate(periods)])
+
+
+def pushed(past: Float[Array, "time n"], newest: Float[Array, " n"]) -> Array:
+    """Return the rows with a newest one at the end, and without the oldest."""
+    return jnp.concatenate([past, newest[None]])[1:]
+
+
+def rows_needed(periods: tuple[float, ...]) -> int:
+    """Return how many rows `delayed` needs for these delays."""
+    return 1 + ceil(max(periods, default=0.0))
+
+
+def _one_each(name: str, delays: tuple[float, ...], count: int) -> tuple[float, ...]:
+    """Return one delay for each of `count` variables."""
+    if len(delays) <= 1:
+        return (delays or (0.0,)) * count
+    if len(delays) != count:
+        raise ValueError(
+            f"latency.{name} needs one number or {count}, got {len(delays)}"
+        )
+    return delays
+
+
+def _periods(delay: float, dt: float) -> float:
+    """Return a delay in sampling periods, without the rounding error of a quotient."""
+    return round(delay / dt, 9)

@@ -1,0 +1,88 @@
+"""Latency: mean commands over a period, and states of the past."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sfkd_jax.geometry import compose
+from sfkd_jax.latency import CommandDelay, Latency, delayed, rows_needed
+
+FINE = 1000
+"""Parts of a period in which a mean is computed numerically."""
+
+
+@pytest.mark.parametrize("periods", [(0.0, 0.0), (1.0, 1.0), (0.3, 2.45), (3.0, 0.7)])
+@pytest.mark.parametrize("period", [0, 1])
+def test_the_acting_command_is_the_mean_of_what_acts(periods, period):
+    delay = CommandDelay(periods)
+    random = np.random.default_rng(0)
+    commands = random.normal(size=(delay.steps + 1, 2)).astype(np.float32)
+    acting = delay.acting(jnp.asarray(commands[:-1]), jnp.asarray(commands[-1]), period)
+    times = period + (np.arange(FINE) + 0.5) / FINE
+    for control, late in enumerate(periods):
+        # Command k of those before this call acts from k + late on, the last for ever.
+        which = np.floor(times - late).astype(int) + delay.steps
+        expected = commands[np.minimum(which, delay.steps), control].mean()
+        np.testing.assert_allclose(acting[control], expected, atol=5e-3)
+
+
+def test_before_the_first_command_the_present_one_acts():
+    delay = CommandDelay((1.5, 0.0))
+    sent = jnp.full((delay.steps, 2), jnp.nan)
+    command = jnp.asarray([0.1, -2.0])
+    np.testing.assert_allclose(delay.acting(sent, command), command, rtol=1e-6)
+
+
+def test_a_past_pose_is_on_the_arc_that_joins_two_observed_ones():
+    """Exact for a car that turns steadily, across the jump of its yaw from π to −π."""
+
+    def at(time):
+        turned = 0.5 * time
+        arc = jnp.asarray([20.0 * np.sin(turned), 20.0 * (1 - np.cos(turned)), turned])
+        pose = compose(jnp.asarray([3.0, -2.0, 3.0]), arc)
+        wrapped = pose.at[2].set(jnp.arctan2(jnp.sin(pose[2]), jnp.cos(pose[2])))
+        return jnp.append(wrapped, 5.0 + time)
+
+    periods = (1.25, 1.25, 1.25, 0.5)
+    past = jnp.stack([at(0.1 * k) for k in range(rows_needed(periods))])
+    now = 0.1 * (len(past) - 1)
+    state = delayed(past, periods)
+    expected = at(now - 0.125)
+    np.testing.assert_allclose(state[:2], expected[:2], atol=1e-3)
+    turn = (state - expected)[2]
+    np.testing.assert_allclose(np.arctan2(np.sin(turn), np.cos(turn)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(state[3], 5.0 + now - 0.05, rtol=1e-6)
+
+
+def test_nothing_late_is_the_newest_bit_for_bit():
+    past = jnp.asarray(np.random.default_rng(1).normal(size=(1, 5)))
+    assert (delayed(past, (0.0,) * 5) == past[-1]).all()
+    assert CommandDelay((0.0, 0.0)).steps == 0
+
+
+def test_one_number_stands_for_all_and_none_for_nothing():
+    sized = Latency((0.1,), ()).sized(4, 2)
+    assert sized == Latency((0.1,) * 4, (0.0, 0.0))
+    assert not sized.is_none
+    assert Latency().sized(4, 2).is_none
+
+
+def test_younger_entries_wait_for_the_oldest():
+    latency = Latency((0.2, 0.2, 0.2, 0.05), (0.1, 0.3))
+    assert latency.hold_back(0.1) == (0.0, 0.0, 0.0, 1.5)
+    assert latency.loop(0.1).periods == (3.0, 5.0)
+    # 0.3 / 0.1 is 2.9999999999999996: no part of a period may be left of it.
+    assert Latency((0.3,), (0.0,)).loop(0.1).periods == (3.0,)
+
+
+@pytest.mark.parametrize("bad", [-0.1, 2.5, float("nan"), float("inf")])
+def test_delays_that_are_none_are_refused(bad):
+    with pytest.raises(ValueError, match="must be in"):
+        Latency((bad,), ())
+    with pytest.raises(ValueError, match="must be in"):
+        Latency((), (0.1, bad))
+
+
+def test_a_wrong_number_of_delays_is_refused():
+    with pytest.raises(ValueError, match=r"latency\.sensors needs one number or 4"):
+        Latency((0.1, 0.2), ()).sized(4, 2)
