@@ -72,7 +72,7 @@ APPLICATIONS = {
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}
     | {"certificate", "driving.certificate"},
-    "__init__": {"export", "geometry", "info", "policy", "store"},
+    "__init__": {"export", "geometry", "info", "latency", "policy", "store"},
 }
 """What puts the floors together."""
 ARROWS = GROUND | DRIVING | PAPER | APPLICATIONS

@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from sfkd_jax.export import warm_up as warm_up
     from sfkd_jax.geometry import relative as relative
     from sfkd_jax.info import Reason as Reason
+    from sfkd_jax.latency import Latency as Latency
     from sfkd_jax.policy import Policy as Policy
     from sfkd_jax.policy import load as load
     from sfkd_jax.policy import policies as policies
@@ -22,6 +23,7 @@ _LAZY = {
     "warm_up": "export",
     "ArtefactError": "store",
     "Reason": "info",
+    "Latency": "latency",
 }
 
 

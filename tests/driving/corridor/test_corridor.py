@@ -24,6 +24,7 @@ from sfkd_jax.driving.corridor._closed_loop import closed_loop
 from sfkd_jax.driving.corridor._measuring import measure_corridor
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.driving.plants import kinematic
+from sfkd_jax.latency import Latency
 
 NAMES = (*JOINT, *ALONE)
 
@@ -77,7 +78,9 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     options = TINY | {"frame": PATH_FRAME, "transport": False, "budget": "joint"}
     model = models.sfkd(path_space(), **options)
     params = model.init(jax.random.key(0))
-    loop = closed_loop(kinematic(), model, params, any_law(), (0.015, 0.015, 0.002))
+    late = Latency((0.1,), (0.05,))
+    noise = (0.015, 0.015, 0.002)
+    loop = closed_loop(kinematic(), model, params, any_law(), noise, late)
     generate = drives.generate_along_path
     driven = jax.jit(
         lambda key: generate(loop.plant, key, segments=120, steps=20, **BOX)
@@ -128,6 +131,8 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     verify_driving(again, trained)
     assert measured.outputs.keys() == {"position", "yaw"}
     assert corridor.conditions.acceleration == 2.0
+    assert again.corridor.conditions.latency == late.sized(4, 2)
+    assert len(again.corridor.margins.delay_s) == len(again.corridor.margins.speed)
     groups = corridor.by_group
     assert list(groups) == ["bends", "speeds", "lane_changes"]
     # The claim is that of the worst group.

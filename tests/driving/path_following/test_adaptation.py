@@ -16,6 +16,7 @@ from sfkd_jax.driving.path_following.wrappers import _estimator as estimator
 from sfkd_jax.driving.path_following.wrappers._adaptation import _compensation
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo
+from sfkd_jax.latency import Latency
 from sfkd_jax.rollout import Offset, with_offset
 from sfkd_jax.types import BODY, Controller
 
@@ -195,6 +196,49 @@ def test_the_true_cause_lies_within_the_reported_spread():
         gap = np.abs(info.adaptation.causes[30:, :2] - truth)
         inside.append(gap <= 3.0 * info.adaptation.causes_std[30:, :2] + 1e-3)
     assert np.mean(inside) > 0.95
+
+
+def test_causes_are_those_of_the_command_that_acted():
+    """With 0.2 s of latency, after a start beside the path. Commands that are taken for
+    those of another time look like an error of the steering.
+    """
+    latency = Latency((0.1,), (0.1,)).sized(4, 2)
+    delay = latency.loop(PLANT.dt)
+    late = plants.late_loop(latency, states=4, dt=PLANT.dt)
+    model = with_offset(MODEL)
+    prediction = path_following.Prediction(model=model, law=LAW, dt=PLANT.dt)
+    predictor = path_following.Predictor(
+        inner=law_alone(), prediction=prediction, delay=delay
+    )
+    inner = predictor.controller()
+    options = SETTINGS | {"model": MODEL, "law": LAW, "shrinkage": 0.0}
+    inner = path_following.Adaptation(inner=inner, delay=delay, **options).controller()
+    horizon = HORIZON + delay.steps
+    about = {"model": MODEL, "law": LAW, "dt": PLANT.dt, "horizon": horizon}
+    gate = path_following.Gate(inner=inner, delay=delay, **about).controller()
+    controller = path_following.along_reference(gate, coordinates=3, delay=delay)
+    env = jnp.asarray([0.7, 0.0])
+
+    def step(carry, time):
+        state, memory, pending = carry
+        state = state.at[0].set(time)
+        arrived, pending = late.observe(pending, jnp.append(state, time))
+        ahead = 10.0 * 0.1 * (arrived[4] + 1.0 + jnp.arange(horizon))
+        zero = jnp.zeros(horizon)
+        reference = jnp.stack([ahead, zero, zero, zero + 10.0], axis=1)
+        seen = arrived[:4].at[0].set(arrived[4])
+        action, memory, info = controller.act({}, memory, seen, env, reference)
+        acting, pending = late.actuate(pending, action)
+        state = PLANT.step(state, acting.at[0].add(0.01), env)
+        return (state, memory, pending), info.adaptation.causes
+
+    start = jnp.asarray([0.0, 0.3, 0.0, 10.0])
+    memory = controller.init(jax.random.key(0))
+    carry = (start, memory, late.init(jnp.append(start, 0.0)))
+    _, causes = jit(lambda c: jax.lax.scan(step, c, jnp.arange(60.0)))(carry)
+    steering = np.asarray(causes)[5:, estimator.STEERING]
+    # Without `delay` it is wrong by more.
+    np.testing.assert_allclose(steering, 0.01, atol=5e-3)
 
 
 def test_wind_is_estimated_if_it_is_not_measured():

@@ -83,6 +83,27 @@ def test_the_controller_sees_the_state_at_which_its_command_acts(steps):
     np.testing.assert_allclose(lateral, abs(float(expected[0])), atol=1e-4)
 
 
+def test_younger_entries_wait_until_the_oldest_arrive():
+    """A speed that comes a period earlier is that of the observation one call later."""
+
+    def act(params, memory, xi, env, preview):
+        plan = PlanInfo(states=jnp.tile(xi, (HORIZON, 1)))
+        return jnp.zeros(2), memory, ControllerInfo(plan=plan)
+
+    outer = along_reference(
+        Controller(lambda key: (), act), coordinates=3, hold_back=(0.0, 0.0, 0.0, 1.0)
+    )
+    memory = outer.init(jax.random.key(0))
+    seen = []
+    for speed in (5.0, 6.0, 7.0):
+        state = jnp.asarray([0.0, 0.1 * speed, 0.01, speed])
+        _, memory, info = outer.act({}, memory, state, ENV, circle(1, HORIZON))
+        seen.append(np.asarray(info.path.xi))
+    assert np.isnan(seen[0]).all(), "the first speed belongs to no observation yet"
+    np.testing.assert_allclose([xi[2] for xi in seen[1:]], [5.0, 6.0])
+    np.testing.assert_allclose(seen[2][0], 0.7, atol=0.05)
+
+
 def test_part_of_a_period_is_part_of_a_step():
     """Between the predictions of the whole steps before and after."""
     start = circle(0, 1)[0] + jnp.asarray([0.0, 0.1, 0.02, 0.0])

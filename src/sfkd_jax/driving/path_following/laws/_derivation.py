@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.driving.path_coordinates import LATERAL, PATH_SPEED, path_step
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
-from sfkd_jax.ranges import AtLeastTwo, Positive, Span
+from sfkd_jax.ranges import AtLeastTwo, NonNegative, Positive, Span
 from sfkd_jax.types import Control, Scalar, Step
 
 NEWTON = 6
@@ -46,6 +46,7 @@ def derive_path_law(
     heading: float = 240.0,
     velocity: float = 5.0,
     curvature: Positive = 100.0,
+    curvature_power: NonNegative = 0.0,
     drive: Positive = 0.5,
 ) -> PathLaw:
     """Tabulate steady turns and gains over (v_ref² κ, v_ref, e), from a step alone.
@@ -73,9 +74,11 @@ def derive_path_law(
         velocity: weight [s²/m²]; the weights of further coordinates are zero.
         curvature: weight of the steering [m²], on the curvature that it produces on the
             steady turns. Where the tyres give less, the law steers more, and the loop
-            stays as fast. The weight is not on the lateral acceleration, so the loop
-            has the same shape along the path at every speed, and one metric serves all
-            speeds.
+            stays as fast. It is the weight at the highest speed. A larger one tolerates
+            more latency.
+        curvature_power: power of the speed with which that weight grows. With 0 the
+            loop has the same shape along the path at every speed, and with 4 the weight
+            is one on the lateral acceleration, and the loop is equally fast in time.
         drive: weight, per control unit².
     """
     low = (-lateral_acceleration, speed[0], *env_low)
@@ -94,9 +97,10 @@ def derive_path_law(
     axes = [jnp.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
     grid = jnp.stack(jnp.meshgrid(*axes[1:], indexing="ij"), axis=-1)
 
-    def gain_of(slopes: Array, steering_slope: Scalar) -> Array:
+    def gain_of(slopes: Array, steering_slope: Scalar, reference: Scalar) -> Array:
+        weight = curvature * (reference / speed[1]) ** curvature_power
         # d steering / d curvature says what the steering is worth on this turn.
-        controls = jnp.stack([curvature / steering_slope**2, jnp.asarray(drive)])
+        controls = jnp.stack([weight / steering_slope**2, jnp.asarray(drive)])
         return riccati_gain(slopes, (lateral, heading, velocity), controls)
 
     row = partial(_row, path_step(step), gain_of, coordinates, axes[0])
@@ -117,7 +121,7 @@ def derive_path_law(
 
 def _row(
     step: PathStep,
-    gain_of: Callable[[Array, Scalar], Array],
+    gain_of: Callable[[Array, Scalar, Scalar], Array],
     size: int,
     accelerations: Array,
     condition: Array,
@@ -126,7 +130,7 @@ def _row(
 
     Args:
         step: of the vehicle in path coordinates.
-        gain_of: (slopes of the step, d steering / d curvature) -> K.
+        gain_of: (slopes of the step, d steering / d curvature, v_ref) -> K.
         size: of ξ.
         accelerations: the v_ref² κ.
         condition: (v_ref, *e).
@@ -164,7 +168,8 @@ def _row(
     slopes = jnp.clip(slopes, lowest, highest)
 
     def gain(kappa: Scalar, turn: Array, slope: Scalar) -> Array:
-        return gain_of(by_differences(moved(kappa), turn)[1], slope)
+        slopes_of_step = by_differences(moved(kappa), turn)[1]
+        return gain_of(slopes_of_step, slope, condition[0])
 
     gains = jax.vmap(gain)(curvatures, turns, slopes)
     return turns[:, :-2], turns[:, -2:], gains
