@@ -54,10 +54,9 @@ def certified(monkeypatch, tmp_path):
         first = run(f"root={tmp_path}", *recorded)
         first.directory.mkdir(parents=True, exist_ok=True)
         first.policy_path.touch()
-        certification = first.settings.certification
         document = {
             "valid": True,
-            "provenance": {"settings": stages._recorded_certification(certification)},
+            "provenance": {"settings": stages._recorded_certification(first)},
         }
         write_json(first.certificate_path, document)
         made.clear()
@@ -73,10 +72,17 @@ def test_a_certificate_with_the_same_settings_is_kept(certified):
     assert certified((), "certification.signing_key=key.pem") == 0
 
 
-@pytest.mark.parametrize("change", ["level=0.8", "corridor.runs=99"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        "certification.level=0.8",
+        "certification.corridor.runs=99",
+        "latency.controls=[0.1]",
+    ],
+)
 def test_one_with_other_settings_is_made_again(certified, change):
     """Otherwise cells would be driven with it and filed under the new settings."""
-    assert certified((), f"certification.{change}") == 1
+    assert certified((), change) == 1
 
 
 ALONG = ("+experiment=s3",)
@@ -94,6 +100,17 @@ def check(*overrides):
 @pytest.mark.parametrize("name", PATH_MODELS)
 def test_every_path_model_builds_with_its_planner(name):
     check(*PATH_MODELS[name])
+
+
+def test_latency_is_of_every_sensor_and_control_or_of_all():
+    """Another number, or one that no buffer holds, is refused before anything is made."""
+    assert run(*ALONG, "latency.sensors=[0.1]").latency.sensors == (0.1,) * 4
+    with pytest.raises(ValueError, match=r"latency\.sensors needs one number or 4"):
+        check("latency.sensors=[0.1,0.2]")
+    with pytest.raises(ValueError, match="must be in"):
+        check("latency.controls=[3.0]")
+    with pytest.raises(ValueError, match="latency needs a model in path coordinates"):
+        stages.check_settings(run("+experiment=s3_body", "latency.controls=[0.1]"))
 
 
 def test_a_law_alone_is_a_system_along_a_path_only():

@@ -179,7 +179,7 @@ def _recorded_certification(run: Run) -> dict[str, Any]:
     """Return the settings of the certification that a certificate records."""
     recorded = store.plain(run.settings.certification)
     if not run.latency.is_none:
-        recorded["latency"] = store.plain(run.settings.latency)
+        recorded["latency"] = store.plain(dataclasses.asdict(run.latency))
     # They say what to do, and not what is claimed.
     del recorded["renew"]
     del recorded["signing_key"]
