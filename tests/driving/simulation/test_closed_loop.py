@@ -15,6 +15,7 @@ from sfkd_jax.driving import path_following, paths, plants, scenarios, simulatio
 from sfkd_jax.driving.simulation import _loops, disturbed_environment
 from sfkd_jax.driving.simulation.metrics import SIGNALS
 from sfkd_jax.info import ControllerInfo, PlanInfo
+from sfkd_jax.latency import Latency
 from sfkd_jax.types import Controller
 
 PLANT, DYNAMIC = plants.kinematic(), plants.dynamic()
@@ -145,6 +146,40 @@ def test_two_systems_meet_the_same_sensor_noise_whatever_they_do_with_their_own_
     np.testing.assert_array_equal(first.states, truth)
     quiet = jit(still())(road, key)
     np.testing.assert_array_equal(quiet.controls, np.zeros((STEPS, 2)))
+
+
+def test_late_sensors_show_the_past_and_late_commands_act_later():
+    """A car that keeps its speed is seen where it was, beside the reference of there."""
+    road, key = at(roads(), 0), jax.random.key(5)
+    speed = 8.0
+
+    def plant(state, command, env):
+        # What acted is written where nothing else is.
+        return state.at[0].add(DT * speed).at[3].set(command[0])
+
+    def act(params, state, observation, env, reference):
+        info = ControllerInfo(planner=(observation, reference[0]))
+        return jnp.stack([state, 0.0 * state]), state + 1.0, info
+
+    drive = partial(
+        simulation.simulate,
+        plant,
+        Controller(lambda key: jnp.zeros(()), act),
+        {},
+        dt=DT,
+        horizon=3,
+        record={"seen": lambda info: info.planner},
+    )
+    prompt = jit(drive)(road, key)
+    late = jit(partial(drive, latency=Latency((2.0 * DT,), (1.5 * DT,))))(road, key)
+    seen, first = (np.asarray(part) for part in late.signals["seen"])
+    truth, ahead = (np.asarray(part) for part in prompt.signals["seen"])
+    np.testing.assert_allclose(seen[2:, 0], truth[:-2, 0], atol=1e-4)
+    np.testing.assert_allclose(seen[:2, 0], truth[0, 0], atol=1e-4)
+    np.testing.assert_allclose(first[2:], ahead[:-2], atol=0.05)
+    # Command k is the number k: half of k − 2 and half of k − 1 act in period k.
+    acted = np.asarray(late.states)[1:, 3]
+    np.testing.assert_allclose(acted[2:], np.arange(2, len(acted)) - 1.5, atol=1e-4)
 
 
 def test_no_key_is_used_twice_and_pushes_have_a_stream_of_their_own():

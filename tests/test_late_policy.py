@@ -1,0 +1,79 @@
+"""A shipped policy on a car with latency: it drives, says so, and claims nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit
+
+import sfkd_jax
+from sfkd_jax import assembly
+from sfkd_jax.driving import simulation
+from sfkd_jax.driving.scenarios import Scenario
+
+LATENCY = sfkd_jax.Latency((0.06,), (0.04,))
+"""As long as the laws that ship tolerate, and in parts of a period."""
+
+
+@pytest.fixture(scope="module")
+def late():
+    return sfkd_jax.load("kinematic_path", latency=LATENCY)
+
+
+def episode(policy, seconds=15.0):
+    """On S3, whose friction and wind switch every 3 s."""
+    family = assembly.build_scenario(
+        {"name": "s3", "speed": 10.0}, policy.vehicle, duration=seconds
+    )
+    scenario: Scenario = family(jax.random.key(3))
+    drive = jit(
+        lambda key: simulation.simulate(
+            policy.vehicle.step,
+            policy.controller,
+            policy.params,
+            scenario._replace(observed_envs=scenario.envs),
+            key,
+            dt=policy.vehicle.dt,
+            horizon=policy.interface["horizon"],
+            observation_noise=policy.vehicle.sensor_noise,
+            latency=LATENCY,
+            record={"claim": lambda info: info.claim},
+        )
+    )
+    return jax.tree.map(np.asarray, drive(jax.random.key(4)))
+
+
+def test_it_follows_its_path_and_claims_nothing(late):
+    """The corridor that ships is that of a car without latency."""
+    driven = episode(late)
+    assert np.abs(driven.lateral).max() < 0.29
+    claim = driven.signals["claim"]
+    assert np.isnan(claim.bound).all()
+    assert set(claim.reason.tolist()) == {sfkd_jax.Reason.NOT_CALIBRATED}
+    assert "latency" in sfkd_jax.Reason.NOT_CALIBRATED.advice
+
+
+def test_it_says_what_is_late_and_reads_the_road_until_its_command_acts(late):
+    assert "latency, compensated: sensors 0.06 s, controls 0.04 s" in repr(late)
+    assert late.interface["horizon"] == 21
+    assert late.interface["latency_s"]["sensors"]["yaw"] == 0.06
+    assert late.interface["latency_s"]["controls"]["steering"] == 0.04
+    on_time = sfkd_jax.load("kinematic_path")
+    assert on_time.interface["horizon"] == 20
+    assert "latency" not in repr(on_time)
+
+
+def test_a_reference_without_these_points_is_refused(late):
+    state = late.controller.init(jax.random.key(0))
+    points = jnp.stack([jnp.arange(1.0, 21.0), *[jnp.zeros(20)] * 3], axis=1)
+    with pytest.raises(ValueError, match="reference must have shape"):
+        late.controller.act(
+            late.params, state, jnp.zeros(4), jnp.asarray([0.5, 0.0]), points
+        )
+
+
+def test_delays_of_another_number_of_sensors_are_refused():
+    with pytest.raises(ValueError, match=r"latency\.sensors needs one number or 4"):
+        sfkd_jax.load("kinematic_path", latency=sfkd_jax.Latency((0.1, 0.2), ()))
+    with pytest.raises(ValueError, match="latency needs a model in path coordinates"):
+        sfkd_jax.load("kinematic", latency=LATENCY)
