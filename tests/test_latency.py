@@ -67,6 +67,13 @@ def test_one_number_stands_for_all_and_none_for_nothing():
     assert Latency().sized(4, 2).is_none
 
 
+def test_in_words_equal_delays_are_one():
+    assert (
+        str(Latency((0.06,), (0.04,)).sized(4, 2)) == "sensors 0.06 s, controls 0.04 s"
+    )
+    assert str(Latency((0.1, 0.2), ())) == "sensors 0.1, 0.2 s, controls 0 s"
+
+
 def test_younger_entries_wait_for_the_oldest():
     latency = Latency((0.2, 0.2, 0.2, 0.05), (0.1, 0.3))
     assert latency.hold_back(0.1) == (0.0, 0.0, 0.0, 1.5)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sfkd_jax import assembly, policy, store
+from sfkd_jax.assembly import VehicleSettings
 from sfkd_jax.experiment import evaluating, run_directory
 from sfkd_jax.experiment.command import hydra_command
 from sfkd_jax.experiment.options import Settings
@@ -14,7 +15,7 @@ from sfkd_jax.experiment.run import Run
 from sfkd_jax.report.episodes import of_rows
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.tables import text_table
-from sfkd_jax.settings import replace
+from sfkd_jax.settings import parse, replace
 
 PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s")
 """Metrics of the table."""
@@ -78,7 +79,11 @@ def _load(settings: Settings, name: str) -> policy.Policy:
     trained = None
     if directory.is_dir():
         trained = policy.load(directory, controller=store.plain(settings.controller))
-    if trained is None or trained.settings["vehicle"] != store.plain(settings.vehicle):
+    saved = None
+    if trained is not None:
+        # A policy was saved without the settings that came later.
+        saved = parse(VehicleSettings, trained.settings["vehicle"], "vehicle.")
+    if trained is None or saved != settings.vehicle:
         vehicles = sorted({shipped.vehicle for shipped in policy.policies().values()})
         raise ValueError(
             f"controllers ship for {' and '.join(vehicles)} as they are; "

@@ -44,6 +44,15 @@ class Latency:
     def __post_init__(self) -> None:
         check_intervals(self)
 
+    def __str__(self) -> str:
+        """Return both in words, as in "sensors 0.1 s, controls 0.05 s"."""
+        kinds = {"sensors": self.sensors or (0.0,), "controls": self.controls or (0.0,)}
+        parts = []
+        for kind, delays in kinds.items():
+            shown = delays[:1] if len(set(delays)) == 1 else delays
+            parts.append(f"{kind} {', '.join(f'{delay:g}' for delay in shown)} s")
+        return ", ".join(parts)
+
     def sized(self, states: int, controls: int) -> Latency:
         """Return the same delays, one for each variable.
 

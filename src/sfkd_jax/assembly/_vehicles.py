@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from sfkd_jax import models, store
 from sfkd_jax.driving import path_coordinates, path_following, plants
 from sfkd_jax.driving.drives import Driver
 from sfkd_jax.driving.logs import Columns, from_logs
-from sfkd_jax.ranges import Positive, imported
+from sfkd_jax.ranges import NonNegative, Positive, imported
 from sfkd_jax.settings import OneOf, Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Control, Reference, Space, State, Step
 
@@ -25,12 +26,23 @@ IDENTIFIED = "vehicle"
 
 @takes()
 class VehicleSettings:
-    """A vehicle with its inner loop; the other fields are arguments of its factory."""
+    """A vehicle with its actuators; the other fields are arguments of its factory.
+
+    Attributes:
+        name: of the vehicle.
+        dt: sampling period [s].
+        inner_loop: "speed" for a loop around the speed; "none".
+        speed_gain: of that loop [1/s].
+        servo_lag: of a steering servo [s]; 0 for none.
+        servo_rate: its largest steering rate [rad/s]; None for no limit.
+    """
 
     name: str
     dt: Positive = 0.1
     inner_loop: Annotated[str, OneOf(("none", "speed"))] = "none"
     speed_gain: Positive = 1.0
+    servo_lag: NonNegative = 0.0
+    servo_rate: Positive | None = None
 
     @classmethod
     def subclass_for(cls, values: Values) -> type[VehicleSettings]:
@@ -107,6 +119,9 @@ def build_vehicle(settings: VehicleSettings | Values) -> plants.Vehicle:
     if file is not None:
         options["step"] = partial(_identified_step, file)
     plant = factory(**options)._replace(name=settings.name)
+    if settings.servo_lag:
+        limit = settings.servo_rate or math.inf
+        plant = plants.with_servo(plant, lag=settings.servo_lag, rate=limit)
     if settings.inner_loop == "none":
         return plant
     # Only the speed loop changes what the second control means.

@@ -21,7 +21,6 @@ from sfkd_jax.driving import simulation
 from sfkd_jax.driving.scenarios import COURSES, Scenario
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
-from sfkd_jax.experiment.options import Settings
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import arguments, choose
@@ -193,7 +192,7 @@ class SystemEvaluation:
             self.controller = _in_lane(run, name, system, self.controller)
         # Folded once here; otherwise every control step would fold again.
         self.params = fold(system.model, system.params, on_host)
-        self._columns = _columns(settings, name, system)
+        self._columns = _columns(run, name, system)
         simulate = partial(
             simulation.simulate,
             plant.step,
@@ -280,8 +279,9 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
     )
 
 
-def _columns(settings: Settings, name: str, system: System) -> Row:
+def _columns(run: Run, name: str, system: System) -> Row:
     """Return the columns of a row that do not depend on episodes."""
+    settings = run.settings
     protocol = settings.evaluation
     certificate = system.certificate
     leaves = jax.tree.leaves(unfold(system.params))
@@ -294,6 +294,7 @@ def _columns(settings: Settings, name: str, system: System) -> Row:
         "env": system.env_source,
         "vehicle": settings.vehicle.name,
         "inner_loop": settings.vehicle.inner_loop,
+        "latency": None if run.latency.is_none else str(run.latency),
         "seeds": [settings.seed],
         "episodes": protocol.episodes,
         "episode_s": protocol.episode_s,

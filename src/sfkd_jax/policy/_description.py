@@ -7,7 +7,7 @@ from typing import Any
 
 from sfkd_jax import assembly
 from sfkd_jax.driving.certificate import Conditions, DrivingCertificate, LawMargins
-from sfkd_jax.driving.plants import Vehicle, axes
+from sfkd_jax.driving.plants import axes
 from sfkd_jax.latency import Latency
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
@@ -84,28 +84,13 @@ def describe(
         f"environment, {source}: {in_words(box['names'], box['low'], box['high'])}",
     ]
     if not latency.is_none:
-        lines.append(_latency_in_words(vehicle, latency))
+        lines.append(f"latency, compensated: {latency}")
     if certificate:
         lines.append(_certified_box(certificate, trained))
         lines.extend(_certified_facts(certificate, signature, box["names"]))
     else:
         lines.append("no certificate: nothing is proved, nothing measured")
     return "\n  ".join(lines)
-
-
-def _latency_in_words(vehicle: Vehicle, latency: Latency) -> str:
-    """Return the line about what is late, by name where the delays differ."""
-    parts = []
-    for kind, names, delays in (
-        ("sensors", vehicle.state_names, latency.sensors),
-        ("controls", [c.name for c in vehicle.controls], latency.controls),
-    ):
-        if len(set(delays)) == 1:
-            parts.append(f"{kind} {delays[0]:g} s")
-        else:
-            late = zip(names, delays, strict=True)
-            parts.extend(f"{name} {delay:g} s" for name, delay in late)
-    return f"latency, compensated: {', '.join(parts)}"
 
 
 def _certified_box(certificate: DrivingCertificate, trained: TrainedModel) -> str:

@@ -292,7 +292,7 @@ def _learned(run_dir: Path, images: Path) -> list[Part]:
     return [Picture(path, "Loss by optimisation step")]
 
 
-_TABLE = ("inner_loop", "sampling")
+_TABLE = ("inner_loop", "latency", "sampling")
 """Rows of one table share these; its columns are vehicles and scenarios."""
 _FIGURE = ("vehicle", *_TABLE)
 """Rows of one figure share these."""

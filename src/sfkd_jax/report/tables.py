@@ -132,6 +132,8 @@ def title_of(group: list[Row], columns: Iterable[str]) -> str:
     # Only what is unusual is worth a word.
     if common["inner_loop"] == "speed":
         words["inner_loop"] = "under a speed loop"
+    if common["latency"] is not None:
+        words["latency"] = f"latency of {common['latency']}"
     if controller != "mppi":
         words["controller"] = f"controller {controller}"
     if planner is not None:

@@ -1,5 +1,7 @@
 """Simulated vehicles as pure step functions."""
 
+from sfkd_jax.driving.plants._actuators import with_servo as with_servo
+from sfkd_jax.driving.plants._actuators import with_speed_loop as with_speed_loop
 from sfkd_jax.driving.plants._along_path import along_path as along_path
 from sfkd_jax.driving.plants._along_path import axes as axes
 from sfkd_jax.driving.plants._along_path import path_states as path_states
@@ -24,7 +26,6 @@ from sfkd_jax.driving.plants._vehicle import Vehicle as Vehicle
 from sfkd_jax.driving.plants._vehicle import equivalent_wind as equivalent_wind
 from sfkd_jax.driving.plants._vehicle import rk4 as rk4
 from sfkd_jax.driving.plants._vehicle import side_force as side_force
-from sfkd_jax.driving.plants._vehicle import with_speed_loop as with_speed_loop
 
 FACTORIES = {
     "kinematic": kinematic,

@@ -11,7 +11,6 @@ from sfkd_jax.driving.plants._variables import (
     ACCELERATION,
     CAR_SIZE,
     FRICTION_AND_WIND,
-    SPEED_COMMAND,
     STEERING,
     ControlVariable,
     EnvironmentVariable,
@@ -191,44 +190,3 @@ def rk4(derivative: Step, *, dt: float, substeps: int = 1) -> Step:
         return without_reversing(after)
 
     return step
-
-
-def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
-    """Return the vehicle with a speed command instead of an acceleration.
-
-        a = clip(k_v (v_cmd − v)), held over dt
-
-    Args:
-        vehicle: whose second control is an acceleration, with limits.
-        gain: k_v [1/s].
-
-    Raises:
-        ValueError: the vehicle has no limits, or takes speed commands already.
-    """
-    if vehicle.speed_loop or not vehicle.control_low:
-        raise ValueError(
-            "vehicle.inner_loop=speed needs limits of the acceleration; "
-            "of speed commands: speed_loop=true"
-        )
-    low = vehicle.control_low[1]
-    high = vehicle.control_high[1]
-
-    def closed_loop_of(step: Step) -> Step:
-        def closed(state: State, control: Control, env: Environment) -> State:
-            # The loop demands no more than the actuator can give.
-            acceleration = jnp.clip(gain * (control[1] - state[3]), low, high)
-            return step(state, control.at[1].set(acceleration), env)
-
-        return closed
-
-    # `derivative` stays as it is: that of the plant before any wrapper.
-    return vehicle._replace(
-        step=closed_loop_of(vehicle.step),
-        nominal=closed_loop_of(vehicle.nominal),
-        nominal_derivative=closed_loop_of(vehicle.nominal_derivative),
-        controls=(
-            vehicle.controls[0],
-            SPEED_COMMAND._replace(low=SPEED_RANGE[0], high=SPEED_RANGE[1]),
-        ),
-        speed_loop=True,
-    )

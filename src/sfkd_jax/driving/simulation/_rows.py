@@ -18,7 +18,10 @@ from sfkd_jax.driving.simulation.metrics import (
 )
 from sfkd_jax.evaluation import holm, paired_difference
 
-SHARED = ("scenario", "vehicle", "inner_loop", "controller", "planner", "sampling")
+SHARED = (
+    *("scenario", "vehicle", "inner_loop", "latency"),
+    *("controller", "planner", "sampling"),
+)
 """Columns in which rows that are compared must be equal."""
 IDENTITY = ("system", *SHARED, "env")
 """Columns that identify a row of results.json. A new row replaces the old row with the
