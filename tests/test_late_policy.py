@@ -7,7 +7,7 @@ import pytest
 from helpers import jit
 
 import sfkd_jax
-from sfkd_jax import assembly
+from sfkd_jax import assembly, policy
 from sfkd_jax.driving import simulation
 from sfkd_jax.driving.scenarios import Scenario
 
@@ -77,3 +77,20 @@ def test_delays_of_another_number_of_sensors_are_refused():
         sfkd_jax.load("kinematic_path", latency=sfkd_jax.Latency((0.1, 0.2), ()))
     with pytest.raises(ValueError, match="latency needs a model in path coordinates"):
         sfkd_jax.load("kinematic", latency=LATENCY)
+
+
+def test_an_export_states_its_latency_to_whoever_loads_it(late, tmp_path):
+    """Its programs compensate it, so its policy must not drive without."""
+    settings = late.settings | {
+        "controller": late.settings["controller"] | {"shield": False}
+    }
+    policy.save(tmp_path / "policy.safetensors", late.weights, settings, law=late.law)
+    with pytest.warns(UserWarning, match="nothing is certified"):
+        again = sfkd_jax.load(tmp_path)
+    assert again.latency == late.latency
+    assert again.interface == late.interface
+    for wrong in ({"sensors": [0.1, "x"]}, {"of": [0.1]}, {"controls": [-1.0]}):
+        forged = settings | {"latency": wrong}
+        policy.save(tmp_path / "policy.safetensors", late.weights, forged, law=late.law)
+        with pytest.raises(sfkd_jax.ArtefactError):
+            sfkd_jax.load(tmp_path)

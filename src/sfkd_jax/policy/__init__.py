@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -166,8 +166,9 @@ def load(
             "none" for a policy that reads none.
         adaptive: whether a policy in path coordinates estimates unmeasured forces and
             errors of its inputs while driving, see `path_following.Adaptation`.
-        latency: of the vehicle, which the controller compensates. None for the one of
-            the certificate. With another one nothing is claimed.
+        latency: of the vehicle, which the controller compensates. None for that of an
+            export, or else of the certificate. With another one than that of the
+            certificate nothing is claimed.
         signed_by: public ed25519 key of who must have signed the certificate, as 64
             hexadecimal digits or the path of a PEM file. Only a signature vouches for
             measured numbers. None to accept an unsigned certificate, too.
@@ -221,13 +222,18 @@ def load(
         # 3: `policy_numerics` stands between this function and its caller.
         warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
     return Policy(
-        **vars(replace(trained, settings=settings)),
+        **vars(replace(trained, settings=_stating(settings, latency))),
         controller=_entrance(planner, trained),
         certificate=certificate,
         signature=signature,
         around=around,
         latency=latency,
     )
+
+
+def _stating(settings: Values, latency: Latency) -> Values:
+    """Return settings with a latency, which an export of the policy then has too."""
+    return settings if latency.is_none else {**settings, "latency": asdict(latency)}
 
 
 def _latency_of(
@@ -238,10 +244,15 @@ def _latency_of(
     """Return the latency to drive with, for each state and control.
 
     Args:
-        trained: the policy.
+        trained: the policy. What `export` writes states a latency in its settings.
         certificate: whose corridor states the latency that it was measured with.
         latency: that the caller states, or None.
     """
+    if latency is None and "latency" in trained.settings:
+        saved = trained.settings["latency"]
+        latency = Latency(
+            **{kind: tuple(map(float, delays)) for kind, delays in saved.items()}
+        )
     if latency is None:
         corridor = certificate.corridor if certificate else None
         latency = corridor.conditions.latency if corridor else NO_LATENCY
