@@ -64,6 +64,9 @@ from sfkd_jax.types import (
     State,
 )
 
+YAW = 2
+"""Column of the yaw in the points of a reference."""
+
 
 class Preview(NamedTuple):
     """The road ahead, as controllers along a path see it.
@@ -98,29 +101,27 @@ class Preview(NamedTuple):
     reason: Int[Array, ""]
 
 
-def later_road(
-    road: Float[Array, "preview 2"], periods: float
-) -> Float[Array, "later 2"]:
-    """Return κ and v_ref some periods later; between two rows, their mean."""
+def later(
+    rows: Float[Array, "step column"], periods: float, *, angle: int | None = None
+) -> Float[Array, "later column"]:
+    """Return the rows of a reference or a preview some periods later.
+
+    Between two rows they are interpolated linearly.
+
+    Args:
+        rows: one a period.
+        periods: by how many.
+        angle: column of an angle [rad], which may jump by 2π; None without one.
+    """
     whole = ceil(periods)
     share = whole - periods
-    later = road[whole:]
+    after = rows[whole:]
     if not share:
-        return later
-    return later + share * (road[whole - 1 : -1] - later)
-
-
-def later_points(
-    points: Float[Array, "preview 4"], periods: float
-) -> Float[Array, "later 4"]:
-    """Return the points of a reference some periods later, between two points."""
-    whole = ceil(periods)
-    share = whole - periods
-    later = points[whole:]
-    if not share:
-        return later
-    gap = points[whole - 1 : -1] - later
-    return later + share * gap.at[:, 2].set(wrap_angle(gap[:, 2]))
+        return after
+    gap = rows[whole - 1 : -1] - after
+    if angle is not None:
+        gap = gap.at[:, angle].set(wrap_angle(gap[:, angle]))
+    return after + share * gap
 
 
 def state_beside(xi: PathState, preview: Preview) -> State:
@@ -222,7 +223,9 @@ class AlongReference(Stateful):
         info = reported(info)
         planned = info.plan.states
         if planned is not None:
-            states = jax.vmap(beside)(planned, later_points(points, self.delay.first))
+            states = jax.vmap(beside)(
+                planned, later(points, self.delay.first, angle=YAW)
+            )
         else:
             states = reported(info.planner).plan.states
         info = info._replace(plan=info.plan._replace(states=states))

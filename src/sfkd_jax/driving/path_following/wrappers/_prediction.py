@@ -21,9 +21,9 @@ from sfkd_jax.driving.path_coordinates import (
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
 from sfkd_jax.driving.path_following.tasks._along_path import (
+    YAW,
     Preview,
-    later_points,
-    later_road,
+    later,
     state_beside,
 )
 from sfkd_jax.driving.path_following.wrappers._conditions import ANYWHERE, Conditions
@@ -186,10 +186,10 @@ class Predictor(Stateful):
         periods = periods_ahead(self.delay, preview.road, preview.sent)
         ahead, distance = predict.ahead(fiber, nearest, xi, periods)
         first = self.delay.first
-        reference = later_points(preview.reference, first)
+        reference = later(preview.reference, first, angle=YAW)
         passed = _way(preview.reference, first)
         shown = preview._replace(
-            road=later_road(preview.road, first),
+            road=later(preview.road, first),
             reference=reference,
             along=preview.along + distance - passed,
         )
