@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 
 from sfkd_jax.geometry import compose
-from sfkd_jax.latency import CommandDelay, Latency, delayed, rows_needed
+from sfkd_jax.latency import (
+    CommandDelay,
+    Latency,
+    ReadingBuffer,
+    delayed,
+    rows_needed,
+)
 
 FINE = 1000
 """Parts of a period in which a mean is computed numerically."""
@@ -93,3 +99,62 @@ def test_delays_that_are_none_are_refused(bad):
 def test_a_wrong_number_of_delays_is_refused():
     with pytest.raises(ValueError, match=r"latency\.sensors needs one number or 4"):
         Latency((0.1, 0.2), ()).sized(4, 2)
+
+
+def jittered(seed):
+    """Readings of a car that turns, each up to 0.2 s late, in the order they arrive."""
+    random = np.random.default_rng(seed)
+    times = np.round(0.1 * np.arange(60), 9)
+    turned = 0.3 * times
+    x = 20.0 * np.sin(turned)
+    y = 20.0 * (1.0 - np.cos(turned))
+    states = np.stack([x, y, turned, 6.0 + 0.1 * times], axis=1)
+    arrivals = times + 0.1 * random.integers(0, 3, len(times))
+    return times, states, arrivals
+
+
+def test_readings_that_come_in_any_order_are_of_one_time():
+    """Each is handed over 0.2 s after its time, whenever it came."""
+    times, states, arrivals = jittered(0)
+    buffer = ReadingBuffer(0.2)
+    for now in times[2:]:
+        for which in np.flatnonzero(np.isclose(arrivals, now)):
+            buffer.push(times[which], states[which])
+        if now > times[3]:
+            seen = buffer.at(now)
+            np.testing.assert_allclose(
+                seen, states[np.isclose(times, now - 0.2)][0], atol=1e-5
+            )
+
+
+def test_a_lost_reading_is_on_the_arc_of_its_neighbours():
+    times, states, _ = jittered(1)
+    buffer = ReadingBuffer(0.2)
+    # On Earth, where float32 resolves half a metre.
+    states = states + np.asarray([5e5, 4.5e6, 0.0, 0.0])
+    for which in (0, 2, 3):
+        buffer.push(times[which], states[which])
+    np.testing.assert_allclose(buffer.at(0.3), states[1], rtol=0.0, atol=2e-3)
+    # Beyond the gap nothing is known, and what follows still is.
+    buffer.push(times[8], states[8])
+    assert np.isnan(buffer.at(0.7)).all()
+    np.testing.assert_allclose(buffer.at(1.0), states[8])
+
+
+def test_a_buffer_keeps_no_reading_that_no_call_needs():
+    buffer = ReadingBuffer(0.1)
+    for step in range(1000):
+        buffer.push(0.1 * step, np.zeros(4))
+        buffer.at(0.1 * step)
+    assert len(buffer._readings) <= 3
+
+
+def test_times_that_are_none_are_refused_or_ignored():
+    with pytest.raises(ValueError, match="latest must be in"):
+        ReadingBuffer(float("nan"))
+    buffer = ReadingBuffer(0.1)
+    with pytest.raises(ValueError, match="no reading"):
+        buffer.at(0.0)
+    buffer.push(float("nan"), np.zeros(4))
+    buffer.push(0.0, np.ones(4))
+    np.testing.assert_array_equal(buffer.at(0.1), np.ones(4))

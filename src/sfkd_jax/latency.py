@@ -173,6 +173,82 @@ def delayed(
     return jnp.stack([times[delay][i] for i, delay in enumerate(periods)])
 
 
+class ReadingBuffer:
+    """Makes readings whose delays vary readings of one delay.
+
+        buffer = ReadingBuffer(latest=0.2)
+        buffer.push(reading_time, observation)      # whenever one arrives
+        observation = buffer.at(now)                # at every call of the controller
+
+    Every reading is handed over when the latest one could have arrived. At a call the
+    buffer returns the state of `latest` seconds ago, on the arc between the readings
+    before and after that time. A controller with `Latency((latest,), …)` predicts from
+    there. It lives on the host, and takes readings in any order.
+
+    Attributes:
+        latest: longest delay of a reading [s].
+        gap: longest time between two readings to interpolate between [s]. Where they
+            are farther apart, nothing is known.
+    """
+
+    def __init__(self, latest: float, *, gap: float = 0.25) -> None:
+        """Return an empty buffer.
+
+        Raises:
+            ValueError: a time is negative or not finite.
+        """
+        if not (0.0 <= latest < np.inf and 0.0 < gap < np.inf):
+            raise ValueError(
+                f"latest must be in [0, inf) and gap in (0, inf), got {latest}, {gap}"
+            )
+        self.latest = latest
+        self.gap = gap
+        self._readings: dict[float, np.ndarray] = {}
+
+    def push(self, time: float, observation: Float[np.ndarray, " state"]) -> None:
+        """Add a reading; one of the same time is replaced, one without a time ignored.
+
+        Args:
+            time: at which the state was measured [s].
+            observation: pose, and what follows it.
+        """
+        if np.isfinite(time):
+            self._readings[float(time)] = np.asarray(observation, dtype=float)
+
+    def at(self, now: float) -> Float[np.ndarray, " state"]:
+        """Return the state of `latest` seconds ago; NaN where it is not known.
+
+        Args:
+            now: time of the call [s]; readings that no later call needs are dropped.
+
+        Raises:
+            ValueError: nothing was ever pushed.
+        """
+        if not self._readings:
+            raise ValueError("no reading was pushed yet")
+        wanted = now - self.latest + 1e-9
+        before = max((t for t in self._readings if t <= wanted), default=None)
+        after = min((t for t in self._readings if t > wanted), default=None)
+        unknown = np.full_like(next(iter(self._readings.values())), np.nan)
+        if before is None:
+            return unknown
+        first = self._readings[before]
+        self._readings = {t: x for t, x in self._readings.items() if t >= before}
+        if wanted - before < 1e-6:
+            return first
+        if after is None or after - before > self.gap:
+            return unknown
+        share = (wanted - before) / (after - before)
+        second = self._readings[after]
+        # From the first position on: far away float32 does not resolve it.
+        way = second[POSE] - np.append(first[:2], 0.0)
+        start = np.append(np.zeros(2), first[2])
+        pose = np.array(along_arc(jnp.asarray(start), jnp.asarray(way), share), float)
+        pose[:2] += first[:2]
+        body = first[BODY] + share * (second[BODY] - first[BODY])
+        return np.concatenate([pose, body])
+
+
 def pushed(past: Float[Array, "time n"], newest: Float[Array, " n"]) -> Array:
     """Return the rows with a newest one at the end, and without the oldest."""
     return jnp.concatenate([past, newest[None]])[1:]
