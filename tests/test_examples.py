@@ -11,12 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import driver
 
 import sfkd_jax
 from sfkd_jax.driving import plants
-from sfkd_jax.info import ControllerInfo, PlanInfo
-from sfkd_jax.types import Controller
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -112,10 +109,13 @@ class StubNode:
         self.name = name
         self.parameters = {}
         self.sent = []
+        self.log = []
         self.timers = []
         self.create_subscription = lambda message, topic, callback, depth: callback
         stamp = SimpleNamespace(to_msg=lambda: 0)
         self.get_clock = lambda: SimpleNamespace(now=lambda: stamp)
+        logger = SimpleNamespace(warning=self.log.append, error=self.log.append)
+        self.get_logger = lambda: logger
 
     def declare_parameter(self, name, value):
         self.parameters[name] = value
@@ -140,9 +140,16 @@ class Message(SimpleNamespace):
         return getattr(self, name)
 
 
+@pytest.fixture(scope="module")
+def shipped():
+    """The shipped policy that the node takes by default, compiled once."""
+    policy = sfkd_jax.load("kinematic_path")
+    return policy, sfkd_jax.warm_up(policy)
+
+
 @pytest.fixture
-def node(monkeypatch):
-    """The example's node, with a law behind it that says when it sees nothing."""
+def node(monkeypatch, shipped):
+    """The example's node."""
     modules = {"rclpy": {}, "rclpy.node": {"Node": StubNode}}
     for name, entry in (
         ("ackermann_msgs", "AckermannDriveStamped"),
@@ -154,26 +161,44 @@ def node(monkeypatch):
         module = ModuleType(name)
         module.__dict__.update(entries)
         monkeypatch.setitem(sys.modules, name, module)
-    law = driver(plants.kinematic())
-
-    def act(params, memory, observation, env, reference):
-        seen = jnp.all(jnp.isfinite(observation))
-        control = jnp.where(seen, law(observation, reference), 0.0)
-        return control, memory, ControllerInfo(plan=PlanInfo(healthy=seen))
-
-    policy = SimpleNamespace(
-        params={},
-        settings={
-            "vehicle": {"dt": 0.1},
-            "controller": {"mppi": {"horizon": 6}},
-            "space": {"body_mean": [0.0]},
-        },
-        controller=Controller(lambda key: (), act),
-    )
-    monkeypatch.setattr(sfkd_jax, "load", lambda path: policy)
-    monkeypatch.setattr(sfkd_jax, "warm_up", lambda _: jax.jit(policy.controller.act))
+    policy, act = shipped
+    monkeypatch.setattr(sfkd_jax, "load", {"kinematic_path": policy}.__getitem__)
+    monkeypatch.setattr(sfkd_jax, "warm_up", lambda _: act)
     source = EXAMPLES / "ros2" / "controller_node.py"
     return runpy.run_path(str(source))["ControllerNode"]()
+
+
+def odometry_of(state):
+    x, y, yaw, v = map(float, state)
+    odometry = Message()
+    turn = Message(w=np.cos(yaw / 2), x=0.0, y=0.0, z=np.sin(yaw / 2))
+    odometry.pose.pose = Message(position=Message(x=x, y=y), orientation=turn)
+    odometry.twist.twist = Message(linear=Message(x=v, y=0.0), angular=Message(z=0.0))
+    return odometry
+
+
+def path_of(points):
+    places = (Message(x=float(x), y=float(y)) for x, y in points)
+    return Message(poses=[Message(pose=Message(position=place)) for place in places])
+
+
+def drive(node, state, steps, *, origin=(0.0, 0.0)):
+    """Drive the car that the policy was trained on, a tick of the node a step."""
+    step = jax.jit(plants.kinematic().step)
+    offset = np.array([*origin, 0.0, 0.0])
+    for _ in range(steps):
+        node.on_odometry(odometry_of(state + offset))
+        node.plan()
+        sent = node.sent[-1].drive
+        control = jnp.asarray([sent.steering_angle, sent.acceleration])
+        state = np.asarray(step(jnp.asarray(state), control, node.env), dtype=float)
+    return state
+
+
+def ready(node, *, origin=(0.0, 0.0)):
+    """Give the node a straight path of 100 m and a road."""
+    node.on_path(path_of([origin, np.add(origin, (100.0, 0.0))]))
+    node.on_road(Message(data=[0.8, 0.0]))
 
 
 def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_blind(
@@ -183,18 +208,8 @@ def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_bl
     assert period == 0.1
     tick()
     assert node.sent == []
-    odometry = Message()
-    path = Message()
-    odometry.pose.pose = Message(
-        position=Message(x=0.0, y=0.3), orientation=Message(w=1.0, x=0.0, y=0.0, z=0.0)
-    )
-    odometry.twist.twist = Message(
-        linear=Message(x=10.0, y=0.0), angular=Message(z=0.0)
-    )
-    places = (Message(x=float(k), y=0.0) for k in range(60))
-    path.poses = [Message(pose=Message(position=place)) for place in places]
-    node.on_path(path)
-    node.on_road(Message(data=[0.8, 0.0]))
+    ready(node)
+    odometry = odometry_of([0.0, 0.3, 0.0, 10.0])
     node.on_odometry(odometry)
     tick()
     assert len(node.sent) == 1
@@ -205,10 +220,64 @@ def test_the_ros_node_waits_for_everything_steers_to_the_path_and_brakes_when_bl
     commands = [message.drive.acceleration for message in node.sent]
     assert commands[-1] == -3.0
     assert all(np.isfinite(commands))
+    assert node.log == ["braking: No odometry comes."]
     node.on_odometry(odometry)
     node.plan()
     assert node.sent[-1].drive.acceleration > -3.0
     assert float(node.progress) < 20.0
+
+
+def test_the_ros_node_starts_from_standstill_and_again_after_a_gap(node):
+    ready(node)
+    state = drive(node, np.zeros(4), 30)
+    assert state[3] > 3.0
+    node.seen -= 10.0
+    for _ in range(20):
+        node.plan()
+    assert node.sent[-1].drive.acceleration == -3.0
+    # It stands where the brake left it.
+    state[3] = 0.0
+    assert drive(node, state, 30)[3] > 3.0
+
+
+def test_the_ros_node_follows_a_path_in_coordinates_of_a_map(node):
+    origin = (5e5, 4.5e6)
+    ready(node, origin=origin)
+    state = drive(node, np.array([0.0, 0.5, 0.0, 8.0]), 30, origin=origin)
+    assert abs(state[1]) < 0.3
+    assert state[3] > 8.0
+    assert node.log == []
+
+
+LINE = [(0.0, 0.0), (9.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("topic", "message"),
+    [
+        ("path", path_of([])),
+        ("path", path_of(LINE[:1])),
+        ("path", path_of([*LINE, LINE[1]])),
+        ("path", path_of([LINE[0], (np.nan, 0.0)])),
+        ("path", path_of([LINE[0], (0.1, 0.0)])),
+        ("road", Message(data=[0.8])),
+        ("road", Message(data=[0.8, 0.0, 0.0])),
+        ("road", Message(data=[np.nan, 0.0])),
+        ("odometry", odometry_of([np.nan, 0.0, 0.0, 5.0])),
+    ],
+)
+def test_the_ros_node_refuses_a_message_in_a_line_and_keeps_the_last(
+    node, topic, message
+):
+    ready(node)
+    node.on_odometry(odometry_of([0.0, 0.0, 0.0, 5.0]))
+    before = (node.path, node.env, node.odometry, node.seen)
+    getattr(node, f"on_{topic}")(message)
+    after = (node.path, node.env, node.odometry, node.seen)
+    assert all(new is old for new, old in zip(after, before, strict=True))
+    (line,) = node.log
+    assert line.startswith(f"{topic} refused")
+    assert "\n" not in line
 
 
 def test_samples_and_vehicles_spread_over_four_devices_give_the_same_controls():

@@ -4,7 +4,7 @@ It subscribes to `odometry`, `path` and `road` (friction and side wind) and publ
 `drive`. It needs rclpy, nav_msgs, std_msgs and ackermann_msgs of a ROS 2 installation
 beside this package.
 
-    python controller_node.py --ros-args -p policy:=runs/s3/sfkd_path/seed=0
+    python controller_node.py --ros-args -p policy:=kinematic_path
 """
 
 import math
@@ -12,6 +12,7 @@ import time
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import rclpy
 from ackermann_msgs.msg import AckermannDriveStamped
 from nav_msgs.msg import Odometry, Path
@@ -20,23 +21,29 @@ from std_msgs.msg import Float32MultiArray
 
 import sfkd_jax
 from sfkd_jax.driving.paths import path_through, project, reference_window
+from sfkd_jax.info import Reason
 
 PARAMETERS = {
-    "policy": "runs/s3/sfkd_path/seed=0",
+    "policy": "kinematic_path",  # the name of one that ships, or a run directory
     "speed": 10.0,  # wanted [m/s]
     "timeout": 0.3,  # age at which an odometry message is too old [s]
-    "patience": 5,  # control steps without a healthy controller before braking
+    "patience": 5,  # control steps without usable inputs before braking
     "seed": 0,
 }
 BRAKING = -3.0  # [m/s²]
+UNUSABLE = (Reason.BAD_REFERENCE, Reason.IMPRECISE)
+"""Reasons against a claim for which the inputs are of no use. The others do not stop
+the car: `healthy` is False at standstill, and a car must start from there.
+"""
 
 
 class ControllerNode(Node):
     """Holds the last messages; a timer plans from them.
 
-    A message that is missing or older than `timeout` becomes an observation of NaN: the
-    controller then continues its last plan and says so, and this node stops the car
-    when that has lasted for `patience` steps.
+    Odometry older than `timeout` becomes an observation of NaN: the controller then
+    continues its last plan, and this node stops the car when that has lasted for
+    `patience` steps. A message that cannot be used is refused with a line in the log,
+    and the last one is kept.
     """
 
     def __init__(self) -> None:
@@ -52,9 +59,11 @@ class ControllerNode(Node):
         self.odometry = None
         self.env = None
         self.path = None
+        # Of the path, in the world [m]: maps need float64, and controllers float32.
+        self.origin = np.zeros(2)
         self.seen = -math.inf  # when the last odometry message came [s]
         self.progress = jnp.zeros(())  # arc length along the path [m]
-        self.blind = 0  # control steps since the controller was healthy
+        self.blind = 0  # control steps since the inputs were usable
 
         self.create_subscription(Odometry, "odometry", self.on_odometry, 1)
         self.create_subscription(Path, "path", self.on_path, 1)
@@ -65,6 +74,10 @@ class ControllerNode(Node):
     def setting(self, name: str):
         """Return the value of a parameter."""
         return self.get_parameter(name).value
+
+    def refuse(self, topic: str, reason: object) -> None:
+        """Say why a message is not used. An exception would end the node."""
+        self.get_logger().warning(f"{topic} refused, the last one is kept: {reason}")
 
     def on_odometry(self, message: Odometry) -> None:
         """Take position, yaw and forward speed.
@@ -85,28 +98,47 @@ class ControllerNode(Node):
             twist.angular.z,
             0.0,
         ]
-        size = 3 + len(self.policy.settings["space"]["body_mean"])
-        self.odometry = jnp.asarray(state[:size])
+        odometry = np.asarray(state[: len(self.policy.vehicle.state_names)])
+        if not np.all(np.isfinite(odometry)):
+            self.refuse("odometry", f"not finite, {odometry}")
+            return
+        self.odometry = odometry
         self.seen = time.monotonic()
 
     def on_path(self, message: Path) -> None:
         """Take a new path, which starts at its first point."""
         positions = [pose.pose.position for pose in message.poses]
-        points = [[position.x, position.y] for position in positions]
-        self.path = path_through(jnp.asarray(points))
+        if len(positions) < 2:
+            self.refuse("path", f"a path needs two poses or more, got {len(positions)}")
+            return
+        points = np.asarray([[position.x, position.y] for position in positions])
+        _, near, origin = sfkd_jax.relative(points[0], points)
+        try:
+            self.path = path_through(jnp.asarray(near))
+        except ValueError as reason:
+            self.refuse("path", reason)
+            return
+        self.origin = origin
         self.progress = jnp.zeros(())
 
     def on_road(self, message: Float32MultiArray) -> None:
         """Take friction [-] and lateral wind [m/s]."""
-        self.env = jnp.asarray(message.data)
+        env = np.asarray(message.data)
+        size = len(self.policy.settings["space"]["env_mean"])
+        if env.shape != (size,) or not np.all(np.isfinite(env)):
+            self.refuse("road", f"{size} finite numbers are needed, got {env}")
+            return
+        self.env = jnp.asarray(env, dtype=float)
 
     def plan(self) -> None:
         """Take one control step."""
         if self.path is None or self.env is None or self.odometry is None:
             return
         fresh = time.monotonic() - self.seen < self.setting("timeout")
-        observation = self.odometry if fresh else jnp.full_like(self.odometry, jnp.nan)
-        self.progress = self.progress + self.setting("speed") * self.dt
+        # The origin is subtracted in float64: float32 resolves half a metre on a map.
+        near = np.concatenate([self.odometry[:2] - self.origin, self.odometry[2:]])
+        observation = jnp.asarray(near if fresh else np.full_like(near, np.nan))
+        self.progress = self.progress + float(self.odometry[3]) * self.dt
         if fresh:
             # Where the odometry says that the car is, searched near the guess.
             self.progress, _ = project(self.path, observation[:2], self.progress)
@@ -120,9 +152,14 @@ class ControllerNode(Node):
         control, self.memory, info = self.act(
             self.policy.params, self.memory, observation, self.env, reference
         )
-        self.blind = 0 if bool(info.healthy) else self.blind + 1
+        reason = Reason(int(info.claim.reason))
+        usable = fresh and reason not in UNUSABLE
+        self.blind = 0 if usable else self.blind + 1
         if self.blind > self.setting("patience"):
             control = jnp.asarray([control[0], BRAKING])
+        if self.blind == self.setting("patience") + 1:
+            missing = reason.advice if fresh else "No odometry comes."
+            self.get_logger().error(f"braking: {missing}")
         self.publish(control)
 
     def publish(self, control) -> None:

@@ -322,3 +322,46 @@ def test_limits_may_be_one_number_or_infinite(limits, reached):
     )
     u = act(planner)[0][0]
     assert u < -1.5 if reached is None else u == pytest.approx(reached, abs=0.01)
+
+
+@every
+def test_a_cost_that_is_a_truth_value_is_summed_over_the_horizon(search):
+    task = double_integrator(
+        lambda p, x, u, e: x,
+        lambda w, x, u, b, r: x[0] > 0.5,
+        terminal=lambda w, x, r: x[0] > 0.5,
+    )
+    _, _, info = act(SEARCHES[search](task, iterations=1))
+    assert float(info.plan.cost) == HORIZON + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "got"),
+    [
+        ("stage", lambda x, u: x[:1], "float32[1]"),
+        ("stage", lambda x, u: x, "float32[2]"),
+        ("stage", lambda x, u: x[None, :1], "float32[1, 1]"),
+        ("stage", lambda x, u: [x[0]], "[float32[]]"),
+        ("stage", lambda x, u: None, "None"),
+        ("terminal", lambda x, u: u, "float32[1]"),
+        ("dynamics", lambda x, u: x[:, None], "float32[2, 1]"),
+        ("dynamics", lambda x, u: x[None], "float32[1, 2]"),
+        ("dynamics", lambda x, u: [x[0], x[1]], "[float32[], float32[]]"),
+        ("dynamics", lambda x, u: x.astype(int), "int32[2]"),
+    ],
+)
+def test_what_a_function_of_a_task_returns_is_refused_by_its_name(name, value, got):
+    functions = {
+        "dynamics": dynamics,
+        "stage": stage,
+        "terminal": lambda w, x, r: 0.0,
+        name: {
+            "dynamics": lambda p, x, u, e: value(x, u),
+            "stage": lambda w, x, u, b, r: value(x, u),
+            "terminal": lambda w, x, r: value(x, jnp.zeros(1)),
+        }[name],
+    }
+    planner = MPPI(control.free_task(**functions, weights=WEIGHTS), **FEW)
+    with pytest.raises(ValueError, match=f"^{name} must return") as refused:
+        jax.eval_shape(lambda: act(planner))
+    assert str(refused.value).endswith(f", got {got}")

@@ -1,6 +1,7 @@
 """The command line: errors of one line, sweeps."""
 
 import json
+import os
 import subprocess
 import sys
 import textwrap
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 from helpers import last_line
 
-from sfkd_jax.experiment.command import hydra_command
+from sfkd_jax.experiment.command import hydra_command, print_result
 
 SCRIPT = """
     import json, os, sys
@@ -110,6 +111,29 @@ def test_a_directory_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys)
     assert "this directory was deleted: change to one" in capsys.readouterr().err
     monkeypatch.undo()
     tmp_path.mkdir()
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path):
+    command = [sys.executable, "-m", "sfkd_jax.generate", "+experiment=smoke"]
+    done = subprocess.run(
+        [*command, f"root={tmp_path}"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "abacus"},
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("sfkd_jax: JAX_PLATFORMS=abacus: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_result_that_nobody_reads_is_no_error(monkeypatch):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        print_result({"objective": 1.0})
+        # As the interpreter does at its end.
+        stdout.flush()
 
 
 def test_a_failed_job_of_a_sweep_does_not_lose_the_results_of_the_others(outcomes):

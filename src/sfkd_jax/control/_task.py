@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control._factory import factory
+from sfkd_jax.control._returned import as_cost, check_next_state
 from sfkd_jax.geometry import entrywise, outside_box
 from sfkd_jax.types import Control, Params, Scalar
 
@@ -252,13 +253,13 @@ class FreeTask:
     leaf of the reference has the horizon as its leading axis.
 
     Attributes:
-        dynamics: f.
-        stage: ℓ, evaluated at the state after the control.
+        dynamics: f, which returns a state of the same shapes.
+        stage: ℓ, one number, evaluated at the state after the control.
         control_low: lower control limits.
         control_high: upper control limits.
         control_rate: largest change of a control per second, or None.
         dt: sampling period [s], which `control_rate` needs.
-        terminal: φ(weights, x_T, ref_T).
+        terminal: φ(weights, x_T, ref_T), one number.
         weights: a pytree of numbers that both costs read, see `Tuning.cost`.
     """
 
@@ -312,6 +313,7 @@ class FreeTask:
         # Integers become real numbers if the dynamics make them so, because the types
         # of a scan's carry must not change.
         after = jax.eval_shape(self.dynamics, params, observation, before, env)
+        check_next_state("dynamics", observation, after)
 
         def as_after(leaf: Any, after: jax.ShapeDtypeStruct) -> Array:
             return jnp.asarray(leaf, after.dtype)
@@ -343,9 +345,12 @@ class FreeTask:
         self, weights: Any, before: Sample, after: Sample, goal: Any, at: StepIndex
     ) -> Scalar:
         """Return the cost of one step."""
-        cost = self.stage(weights, after.state, after.control, before.control, goal)
+        state = after.state
+        stage = self.stage(weights, state, after.control, before.control, goal)
+        cost = as_cost("stage", stage)
         if self.terminal is not None:
-            cost = cost + at.last * self.terminal(weights, after.state, goal)
+            terminal = as_cost("terminal", self.terminal(weights, state, goal))
+            cost = cost + at.last * terminal
         return cost
 
 

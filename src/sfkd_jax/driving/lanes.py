@@ -82,6 +82,30 @@ def circles(
     )
 
 
+def padded(obstacles: Obstacles, count: int) -> Obstacles:
+    """Return obstacles in a fixed number of rows, of which the last are not present.
+
+    A compiled program is made for one number of rows, and compiled anew for another.
+
+    Args:
+        obstacles: any number of them, also none.
+        count: number of rows.
+
+    Raises:
+        ValueError: there are more obstacles than rows.
+    """
+    rows = obstacles.position.shape[0]
+    if rows > count:
+        raise ValueError(f"{rows} obstacles do not fit in {count} rows: pass more rows")
+
+    def with_zeros(leaf: Array) -> Array:
+        zeros = jnp.zeros((count - rows, *leaf.shape[1:]), leaf.dtype)
+        return jnp.concatenate([leaf, zeros])
+
+    # Of `present`, 0 is False.
+    return Obstacles(*map(with_zeros, obstacles))
+
+
 def clearance(
     obstacles: Obstacles,
     position: Float[Array, "2 ..."],
@@ -208,7 +232,8 @@ def finite(
 ) -> tuple[tuple[Lane, Obstacles], Bool[Array, ""]]:
     """Return a scene in which every number is finite, and whether it was so before.
 
-    Numbers that are not finite become 0. Rows of padding may hold anything.
+    Numbers that are not finite become 0. Rows of padding may hold anything. Without any
+    obstacle there is one row of padding.
 
     Raises:
         ValueError: the shapes of lane and obstacles do not fit together.
@@ -223,6 +248,9 @@ def finite(
             f"got {sizes}; obstacles (obstacle, …), their position (obstacle, step, "
             f"2), got {[leaf.shape for leaf in obstacles]}"
         )
+
+    # Comparisons with each of no obstacles would have no result.
+    obstacles = padded(obstacles, max(count, 1))
 
     def without_padding(leaf: Array) -> Array:
         present = obstacles.present.reshape(-1, *[1] * (leaf.ndim - 1))

@@ -64,6 +64,7 @@ def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None
             use_compilation_cache(Path(settings.root))
             if not settings.optimized:
                 compile_fast()
+            check_devices()
             # Small factorisations, in every step of a training: threads of BLAS would
             # wait for each other, and keep XLA's waiting, for half of the time.
             with threadpool_limits(1, user_api="blas"):
@@ -83,7 +84,7 @@ def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None
             if sweeping:  # Hydra shows the first failure alone
                 print_message(f"sfkd_jax: {type(reason).__name__}: {reason}")
             raise
-        print(json.dumps(document), flush=True)
+        print_result(document)
         return document.get("objective")
 
     composing = hydra.main(
@@ -97,6 +98,33 @@ def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None
         composing()
 
     return start
+
+
+def check_devices() -> None:
+    """Refuse a device that the user has asked for and JAX does not find.
+
+    Otherwise the first number that is computed would fail, with another cause.
+
+    Raises:
+        ValueError: with the message of JAX.
+    """
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    if not platforms:
+        return
+    try:
+        jax.devices()
+    except Exception as reason:  # Also an AssertionError, which has no message.
+        message = next(iter(str(reason).splitlines()), "JAX finds no such device")
+        raise ValueError(f"JAX_PLATFORMS={platforms}: {message}") from None
+
+
+def print_result(document: dict[str, Any]) -> None:
+    """Print the JSON of a result to stdout, which nobody may read any more."""
+    try:
+        print(json.dumps(document), flush=True)
+    except BrokenPipeError:
+        # The interpreter flushes stdout once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _unusable(words: list[str]) -> str | None:

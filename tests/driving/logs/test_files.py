@@ -70,7 +70,9 @@ def same_segments(result, wanted):
 def test_a_run_comes_back_to_the_last_bit(tmp_path, kind):
     columns = recorded_run()
     if kind == "npz":
-        write_npz(tmp_path / "a.npz", columns | {"camera": np.zeros((3, 4))})
+        # An array of objects cannot be read without running code.
+        others = {"camera": np.zeros((3, 4)), "meta": np.array({"car": "A"})}
+        write_npz(tmp_path / "a.npz", columns | others)
     elif kind == "parquet":
         parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
     else:
@@ -82,7 +84,9 @@ def test_a_run_comes_back_to_the_last_bit(tmp_path, kind):
 
 def test_whole_runs_as_x_u_e_come_back_to_the_last_bit(tmp_path):
     runs = [recorded_run(seconds=1.0, phase=0.3 * k) for k in range(12)]
-    stacked(runs, tmp_path)
+    file = stacked(runs, tmp_path)
+    with np.load(file) as opened:
+        np.savez(file, **opened, meta=np.array({"car": "A"}))
     wanted = [np.concatenate(parts) for parts in zip(*map(expected, runs), strict=True)]
     logged, lines = read(tmp_path / "a.npz")
     assert same_segments(together(logged.dataset), wanted)
@@ -332,6 +336,14 @@ WRONG = {
         lambda c: c.update({n: c[n][:21] for n in NAMES}),
         "2 segments are too few for dataset.shares=",
     ),
+    "no friction": (
+        change("friction", slice(100, 105), -1.0),
+        ", line 102: friction is -1, not a measured value (5 rows like this)",
+    ),
+    "no wind": (
+        change("wind", slice(100, 105), 9999.0),
+        ", line 102: wind is 9999, not a measured value (5 rows like this)",
+    ),
     "missing": (
         lambda c: c.pop("yaw"),
         "no column yaw among t, p_x, p_y, v, steering, acceleration, friction, wind; map it with dataset.columns.state",
@@ -571,6 +583,35 @@ def test_oddities_are_warned_of(tmp_path, spoil, options, message):
     assert any(
         line.startswith(f"warning: {tmp_path}") and message in line for line in lines
     )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (scale("steering", np.rad2deg), "yaw follows steering 0.0"),
+        (scale("steering", np.negative), "yaw follows steering -"),
+        (scale("acceleration", lambda a: a / 9.81), "v follows acceleration 9.8"),
+        (scale("friction", lambda mu: 100 * mu), "friction is 60 to "),
+    ],
+)
+def test_one_run_of_many_in_another_unit_is_warned_of(tmp_path, spoil, message):
+    for number in range(8):
+        columns = recorded_run(phase=0.3 * number)
+        write_csv(tmp_path / f"{number}.csv", columns)
+    assert not [line for line in read(tmp_path)[1] if "warning" in line]
+    spoil(columns)
+    path = write_csv(tmp_path / "7.csv", columns)
+    (line,) = [line for line in read(tmp_path)[1] if "warning" in line]
+    assert line.startswith(f"warning: {path}, lines 2 to 302: {message}")
+
+
+def test_a_wind_that_is_constant_in_every_run_is_no_missing_value(tmp_path):
+    for number, wind in enumerate((-6.0, 0.1, 0.1, 0.1)):
+        columns = recorded_run(phase=0.3 * number)
+        columns["wind"] = np.full(301, wind)
+        write_csv(tmp_path / f"{number}.csv", columns)
+    dataset = read(tmp_path)[0].dataset
+    np.testing.assert_array_equal(dataset.env_low[1], -6.0)
 
 
 def test_a_yaw_rate_shows_a_late_yaw_and_driving_backwards_is_right(tmp_path):

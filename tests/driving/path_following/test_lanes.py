@@ -12,7 +12,7 @@ from helpers import jit
 import sfkd_jax
 from sfkd_jax import control
 from sfkd_jax.driving import path_following
-from sfkd_jax.driving.lanes import Obstacles, circles, clearance, lane_along
+from sfkd_jax.driving.lanes import Obstacles, circles, clearance, lane_along, padded
 from sfkd_jax.driving.path_following.lanes._judging import Situation
 from sfkd_jax.driving.path_following.lanes._reference import (
     SPLICE,
@@ -65,6 +65,22 @@ def test_distances_from_boxes_circles_and_things_that_move():
         found = clearance(turned, jnp.zeros(2), step)
         np.testing.assert_allclose(found, [distance, np.inf], atol=1e-5)
     assert clearance(turned, jnp.asarray([4.0, 0.2]))[0] < -1.0
+
+
+def test_padded_obstacles_are_the_same_in_a_fixed_number_of_rows():
+    origin = jnp.zeros(2)
+    for count in (0, 1, 3):
+        places = jnp.asarray([[3.0, 4.0], [0.0, -2.0], [9.0, 0.0]])[:count]
+        few = circles(places, 1.0)
+        rows = padded(few, 3)
+        assert {leaf.shape[0] for leaf in rows} == {3}
+        assert list(rows.present) == [True] * count + [False] * (3 - count)
+        np.testing.assert_array_equal(
+            clearance(rows, origin)[:count], clearance(few, origin)
+        )
+        assert np.all(np.isinf(clearance(rows, origin)[count:]))
+    with pytest.raises(ValueError, match="3 obstacles do not fit in 2 rows"):
+        padded(few, 2)
 
 
 def test_two_boxes_are_never_nearer_than_is_said():
@@ -404,14 +420,16 @@ def test_a_shipped_policy_drives_in_a_lane_of_its_own_class(name, road):
     driver, size = policy.in_lane(), len(policy.vehicle.state_names)
     posts, at = circles(beside(road, POSTS), 0.8), jnp.zeros(size)
 
-    def told(lane):
+    def told(lane, seen=posts):
         """Only traced: what is missing or of another shape fails here."""
-        start, scene = driver.init(jax.random.key(0)), (lane, posts)
+        start, scene = driver.init(jax.random.key(0)), (lane, seen)
         return driver.act(policy.params, start, at, jnp.zeros(2), scene)[2]
 
     info = jax.eval_shape(told, road)
     assert info.lane.reference.shape == (policy.interface["horizon"], 4)
     assert {leaf.shape for leaf in info.lane[1:]} == {info.claim.bound.shape} == {()}
+    nothing = circles(jnp.zeros((0, 2)), 0.8)
+    assert jax.eval_shape(told, road, nothing).lane.reference.shape[1] == 4
     with pytest.raises(ValueError, match=r"of a lane have the shape \(700,\)"):
         jax.eval_shape(told, road._replace(left=jnp.ones(3)))
     with pytest.raises(ValueError, match="no certified corridor"):

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, Shaped
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sfkd_jax.driving.logs._checks import Checks
+from sfkd_jax.driving.logs._comparisons import compare, turns
 from sfkd_jax.driving.logs._findings import Finding, more, warning
 from sfkd_jax.driving.logs._logs import Log
 from sfkd_jax.driving.logs._motion import Delay, find_chords, find_delay
@@ -21,8 +22,6 @@ ALIKE = 1e-3
 """Part of a channel's standard deviation to which numbers are rounded and compared."""
 IN_A_ROW = 10
 """Number of steps that are compared at once. Single steps are alike by chance."""
-LARGEST_STEERING = 1.4
-"""Angle that a wheel cannot exceed, 80° [rad]. Larger commands are no angles."""
 
 
 def check_together(checks: Checks, logs: list[Log]) -> list[Finding]:
@@ -34,6 +33,7 @@ def check_together(checks: Checks, logs: list[Log]) -> list[Finding]:
     """
     return [
         *_steering(checks, logs),
+        *compare(checks, logs),
         *_ranges(checks, logs),
         *_commands(checks, logs),
         *_repeats(checks, logs),
@@ -42,9 +42,9 @@ def check_together(checks: Checks, logs: list[Log]) -> list[Finding]:
 
 def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     """Compare yaw rates with those of a bicycle, ω = v tan δ / L: sign, unit and L."""
-    turns = [_turns(log) for log in logs]
-    expected = np.concatenate([expected_turn for expected_turn, _ in turns])
-    turned = np.concatenate([yaw_rate for _, yaw_rate in turns])
+    turns_of_logs = [turns(log) for log in logs]
+    expected = np.concatenate([expected_turn for expected_turn, _ in turns_of_logs])
+    turned = np.concatenate([yaw_rate for _, yaw_rate in turns_of_logs])
     power = float(np.sqrt(np.mean(expected**2) * np.mean(turned**2)))
     alike = float(np.mean(expected * turned)) / power if power else 0.0
     # The control is no steering angle, or there is too little steering to tell.
@@ -64,17 +64,6 @@ def _steering(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
             f"{where}: {name} and yaw suggest a wheelbase of {wheelbase:.3g} m, "
             f"vehicle.wheelbase is {checks.wheelbase:g}{unit}"
         )
-
-
-def _turns(log: Log) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
-    """Return v tan δ [m/s] and the yaw rate [rad/s] of every step."""
-    steering = log.controls[:-1, 0]
-    # Commands that are no angles of a wheel may be turn commands, taken as tan δ.
-    is_angle = np.abs(log.controls[:, 0]).max() < LARGEST_STEERING
-    tangent = np.tan(steering) if is_angle else steering
-    expected = (log.states[:-1, 3] * tangent)[log.joined]
-    turned = np.diff(np.unwrap(log.states[:, 2]))[log.joined] / log.waits[log.joined]
-    return expected, turned
 
 
 def _ranges(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
@@ -164,13 +153,13 @@ def _commands(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     yaw, speed = checks.columns.state[2:4]
     controls = checks.columns.control
     for log in logs:
-        turns = [_yaw_delay(checks, [log], control).alike for control in (0, 1)]
+        yaws = [_yaw_delay(checks, [log], control).alike for control in (0, 1)]
         speeds = [_speed_delay(checks, [log], control).alike for control in (0, 1)]
-        swapped = turns[1] > 0.8 or (speeds[0] > 0.8 and speeds[1] < 0.4)
-        if turns[0] < 0.4 and swapped:
+        swapped = yaws[1] > 0.8 or (speeds[0] > 0.8 and speeds[1] < 0.4)
+        if yaws[0] < 0.4 and swapped:
             yield Finding(
                 f"{log.whole}: {yaw} follows {controls[1]} (correlation "
-                f"{turns[1]:.2f}), not {controls[0]} ({turns[0]:.2f}); "
+                f"{yaws[1]:.2f}), not {controls[0]} ({yaws[0]:.2f}); "
                 "have columns changed places?"
             )
     delays = (

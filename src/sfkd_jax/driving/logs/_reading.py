@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -91,10 +92,9 @@ def _table(file: Path, columns: Columns, dt: float, blanks: bool) -> Table:
     if suffix == ".parquet":
         return read_parquet(file, wanted)
     source = str(file)
-    arrays = read_npz(file)
-    if {"x", "u"} <= set(arrays) and columns.state[0] not in arrays:
-        return _table_of_arrays(source, arrays, columns, dt)
-    used = {name: arrays[name] for name in among(arrays, wanted)}
+    used, names = read_npz(file, partial(_arrays_to_read, columns, wanted))
+    if _holds_whole_runs(names, columns):
+        return _table_of_arrays(source, used, columns, dt)
     # Without any such array, a later message lists those that the file has.
     first = next(iter(used), "")
     shape = used[first].shape if used else (1,)
@@ -106,7 +106,27 @@ def _table(file: Path, columns: Columns, dt: float, blanks: bool) -> Table:
             )
     if not shape[0]:
         raise ValueError(f"{source}: no rows")
-    return Table(source, used, tuple(arrays), np.arange(shape[0]))
+    return Table(source, used, names, np.arange(shape[0]))
+
+
+def _holds_whole_runs(names: Collection[str], columns: Columns) -> bool:
+    """Return whether an npz file has arrays x and u in place of columns."""
+    return {"x", "u"} <= set(names) and columns.state[0] not in names
+
+
+def _arrays_to_read(
+    columns: Columns, wanted: Collection[str], names: list[str]
+) -> list[str]:
+    """Return which arrays of an npz file are read.
+
+    Args:
+        columns: configured names.
+        wanted: the same in a row, of all channels.
+        names: of the arrays in the file.
+    """
+    if _holds_whole_runs(names, columns):
+        return [name for name in names if name in ("x", "u", "e", columns.time)]
+    return among(names, wanted)
 
 
 def _table_of_arrays(

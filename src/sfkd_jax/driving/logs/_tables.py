@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -246,11 +246,20 @@ def _is_number(value: Any) -> bool:
     return True
 
 
-def read_npz(file: Path) -> dict[str, Shaped[np.ndarray, ...]]:
-    """Return the arrays of an npz file."""
+def read_npz(
+    file: Path, wanted: Callable[[list[str]], Collection[str]]
+) -> tuple[dict[str, Shaped[np.ndarray, ...]], tuple[str, ...]]:
+    """Return the wanted arrays of an npz file, and the names of all of its arrays.
+
+    Args:
+        file: to read.
+        wanted: (names of all arrays) -> those to read. Others may be objects, or larger
+            than the memory.
+    """
     # Pickled objects could run code, so that they are not allowed.
     with _opened(file, "npz") as stream, np.load(stream, allow_pickle=False) as opened:
-        return {name: opened[name] for name in opened.files}
+        names = opened.files
+        return {name: opened[name] for name in wanted(names)}, tuple(names)
 
 
 def read_parquet(file: Path, wanted: Collection[str]) -> Table:
