@@ -15,6 +15,7 @@ from sfkd_jax.driving import drives, plants, simulation
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.driving.plants import StateVariable
 from sfkd_jax.info import ControllerInfo
+from sfkd_jax.latency import Latency
 from sfkd_jax.report.run import write_report
 from sfkd_jax.settings import schema
 from sfkd_jax.types import Controller
@@ -108,9 +109,10 @@ def test_a_policy_of_it_says_its_names_and_units():
     environment = shipped.settings["environment"] | {"source": "measured"}
     told = {**shipped.settings, "environment": environment}
     trained = replace(shipped, vehicle=electric(), settings=told)
-    text = policy.describe(trained, None, "unsigned")
+    latency = Latency().sized(len(trained.vehicle.states), 2)
+    text = policy.describe(trained, None, "unsigned", latency)
     assert "steering [rad], charge [kWh]" in text
-    assert policy.interface_of(trained, None)["observation"][-1] == "charge"
+    assert policy.interface_of(trained, None, latency)["observation"][-1] == "charge"
 
 
 def test_the_page_of_a_run_names_its_axes(registered, tmp_path):

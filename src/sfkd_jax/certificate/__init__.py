@@ -1,5 +1,6 @@
 """The certificate of a policy as a typed tree, and its file."""
 
+from sfkd_jax.certificate._document import ADDED as ADDED
 from sfkd_jax.certificate._document import FORMAT as FORMAT
 from sfkd_jax.certificate._document import Certificate as Certificate
 from sfkd_jax.certificate._document import Provenance as Provenance

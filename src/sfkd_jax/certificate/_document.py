@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -21,6 +21,10 @@ Json: TypeAlias = dict[str, Any]
 """Values that are only compared with others."""
 FORMAT = 2
 """Version of the document; a reader refuses every other one."""
+ADDED = {"added": True}
+"""Metadata of a field that format 2 did not have at first: of a document without it the
+default holds, and it is not written where it has its default.
+"""
 UNHASHED = ("sha256", "signature")
 """Entries of a document that its hash is not about."""
 
@@ -94,7 +98,7 @@ def write(
     Raises:
         ArtefactError: the disk refuses, or the file of the key holds none.
     """
-    entries = store.plain(asdict(certificate))
+    entries = store.plain(_entries(certificate))
     kept = {name: entries.pop(name, None) for name in UNHASHED}
     # What is claimed comes first, also where a subclass adds to it.
     provenance = entries.pop("provenance")
@@ -159,6 +163,26 @@ def signature_of(document: Mapping[str, Any]) -> str:
     signature = read_as(Signature, entries, "signature") if entries else None
     hashed = {key: document[key] for key in document if key not in UNHASHED}
     return _signature.describe_signature(_hash(hashed), signature)
+
+
+def _entries(value: Any) -> Any:
+    """Return a tree of dataclasses as dictionaries.
+
+    `ADDED` fields are left out at their default: a document from before them is written
+    again as it was, with the hash that its signature is about.
+    """
+    if isinstance(value, dict):
+        return {name: _entries(entry) for name, entry in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(_entries, value))
+    if not is_dataclass(value):
+        return value
+    entries = {}
+    for entry in fields(value):
+        part = getattr(value, entry.name)
+        if not (entry.metadata == ADDED and part == entry.default):
+            entries[entry.name] = _entries(part)
+    return entries
 
 
 def _hash(document: Mapping[str, Any]) -> str:

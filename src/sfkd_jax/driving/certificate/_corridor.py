@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-from sfkd_jax.certificate import Box, Coverage, Matrix
+from sfkd_jax.certificate import ADDED, Box, Coverage, Matrix
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.ranges import (
     AtLeastOne,
@@ -59,7 +59,7 @@ class Conditions:
     perturbation: tuple[NonNegative, ...]
     law_model: str
     identified_from: str | None = None
-    latency: Latency = NO_LATENCY
+    latency: Latency = field(default=NO_LATENCY, metadata=ADDED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,7 +254,7 @@ class Corridor:
     shield_horizon: AtLeastOne
     seconds: NonNegative
     recorded: Recorded | None = None
-    margins: LawMargins | None = None
+    margins: LawMargins | None = field(default=None, metadata=ADDED)
 
     @property
     def is_claimed(self) -> bool:
