@@ -122,14 +122,15 @@ class CommandDelay:
         """Return the mean command over a period after an observation.
 
         Args:
-            sent: the last `steps` commands before this one, newest last; NaN stands for
-                the command of this call.
+            sent: at least the last `steps` commands before this one, newest last; NaN
+                stands for the command of this call.
             control: the command of this call, which also stands for later ones.
             period: 0 for the period that begins at the observation, and so on.
         """
         if not self.steps:
             return control
-        known = jnp.where(jnp.isnan(sent), control, sent)
+        last = sent[len(sent) - self.steps :]
+        known = jnp.where(jnp.isnan(last), control, last)
         commands = jnp.concatenate([known, control[None]])
         return jnp.sum(self._shares(period) * commands, axis=0)
 

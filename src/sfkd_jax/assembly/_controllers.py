@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import ceil
 from typing import Any, NamedTuple
 
 from sfkd_jax import control
@@ -10,6 +9,7 @@ from sfkd_jax.assembly._controller_settings import (
     PLANNERS,
     ControllerSettings,
     SearchSettings,
+    controller_horizon,
 )
 from sfkd_jax.assembly._corridor import Corner, conditions_of, in_corridor
 from sfkd_jax.driving import path_following, plants
@@ -339,7 +339,7 @@ def _along_reference(
         model=loop.model,
         law=loop.law,
         dt=loop.plant.dt,
-        horizon=settings.horizon + ceil(loop.delay.first),
+        horizon=controller_horizon(settings, loop.delay),
         conditions=conditions_of(certificate, **loop.env_box),
         reads_env=not loop.estimates_env,
         test=test,

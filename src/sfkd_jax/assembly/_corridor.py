@@ -56,8 +56,8 @@ def in_corridor(
         plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
         certificate: with a corridor.
-        latency: of the vehicle. Nothing is claimed if it is
-            not that of the certificate.
+        latency: of the vehicle. Nothing is claimed if it is not that of the
+            certificate.
     """
     corridor = corridor_of(certificate)
     bounds = corridor.bounds

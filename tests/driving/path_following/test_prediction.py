@@ -171,6 +171,25 @@ def test_with_an_exact_model_a_late_loop_drives_as_one_on_time(
         )
 
 
+def test_a_drive_that_is_later_than_the_steering_follows_it():
+    """It is 0.1 s late beside the steering, and the speed approaches v_ref all the same."""
+    envs = jnp.tile(ENV, (2, 80, 1))
+    loop = closed_loop(PLANT, EXACT, {}, LAW, (), Latency((0.1,), (0.1, 0.2)))
+    driven, readings = drive_along_path(
+        loop.plant,
+        envs,
+        jax.random.key(3),
+        limits=DriveClass(speed=(8.0, 10.5)),
+        sensors=law_sensors(loop),
+        burn_in=0,
+    )
+    assert readings.control.shape == (2, 80, 2)
+    states = np.asarray(driven.states)
+    gap = states[:, 40:-1, 5] - np.asarray(driven.controls)[:, 40:, 3]
+    assert np.abs(gap).max() < 1.5
+    assert np.abs(states[..., 3]).max() < 0.6
+
+
 def test_a_model_of_another_car_is_seen_in_the_late_loop():
     """The equality above would not notice a loop without latency."""
     other = assembly.reference_systems(PLANT, LAW)["nominal"].model

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -55,9 +57,7 @@ def with_speed_loop(vehicle: Vehicle, *, gain: float = 1.0) -> Vehicle:
     )
 
 
-def with_servo(
-    vehicle: Vehicle, *, lag: Positive, rate: Positive = float("inf")
-) -> Vehicle:
+def with_servo(vehicle: Vehicle, *, lag: Positive, rate: float = math.inf) -> Vehicle:
     """Return the vehicle with a servo that turns its wheels to the steering command.
 
         δ̇ = clip((δ_cmd − δ) / T, ±rate)

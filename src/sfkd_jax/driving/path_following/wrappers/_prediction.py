@@ -16,6 +16,7 @@ from sfkd_jax.driving.path_coordinates import (
     HEADING,
     LATERAL,
     PATH_SPEED,
+    SMALLEST_SCALE,
     PathState,
 )
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
@@ -141,7 +142,7 @@ class Prediction:
 
 def _progress(xi: PathState, road: Float[Array, " 2"]) -> Scalar:
     """Return ds/dt = v cos e_ψ / (1 − κ e_y) [m/s]."""
-    scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], 0.2)
+    scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], SMALLEST_SCALE)
     return xi[PATH_SPEED] * jnp.cos(xi[HEADING]) / scale
 
 
