@@ -134,8 +134,10 @@ def shielded():
 
 def gated(inner, model, law, conditions):
     """A controller along a path behind the gate, in the world."""
-    about = {"model": model, "law": law, "dt": PLANT.dt, "horizon": HORIZON}
-    gate = path_following.Gate(inner=inner, conditions=conditions, **about)
+    prediction = path_following.Prediction(
+        model=model, law=law, dt=PLANT.dt, conditions=conditions
+    )
+    gate = path_following.Gate(inner=inner, prediction=prediction, horizon=HORIZON)
     return along(gate.controller())
 
 

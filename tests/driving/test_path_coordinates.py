@@ -11,7 +11,12 @@ import pytest
 from helpers import jit
 
 from sfkd_jax.driving import plants
-from sfkd_jax.driving.path_coordinates import circle_errors, is_valid
+from sfkd_jax.driving.path_coordinates import (
+    circle_errors,
+    curvature_ahead,
+    is_valid,
+    projected,
+)
 from sfkd_jax.driving.paths import path_from_curvature, project
 from sfkd_jax.driving.plants._along_path import step_with_law
 from sfkd_jax.geometry import compose, without_pose
@@ -22,11 +27,11 @@ SLOPES = jit(lambda *at: jax.tree.leaves(jax.jacfwd(circle_errors, (0, 1))(*at))
 CURVATURES = (-0.08, -1e-6, 0.0, 1e-6, 0.02, 0.1)
 
 
-def foot(curvature: float, progress: float) -> jax.Array:
+def foot(curvature, progress) -> jax.Array:
     """The pose on a circle through the origin, after some arc length; by its chord."""
     half = 0.5 * curvature * progress
-    chord = progress * np.sinc(half / np.pi)
-    return jnp.asarray([chord * np.cos(half), chord * np.sin(half), 2 * half])
+    chord = progress * jnp.sinc(half / np.pi)
+    return jnp.stack([chord * jnp.cos(half), chord * jnp.sin(half), 2 * half])
 
 
 @pytest.mark.parametrize("curvature", CURVATURES)
@@ -93,3 +98,19 @@ def test_the_loop_in_path_coordinates_agrees_with_the_drive_in_the_world(
         np.testing.assert_allclose(along[BODY][0], lateral, atol=2e-4)
     np.testing.assert_allclose(along[BODY][2:], world[3:], atol=2e-4)
     assert not np.any(np.asarray(along[:3]))
+
+
+@pytest.mark.parametrize("passed", [-0.9, -0.2, 0.4, 3.3, 14.0])
+@pytest.mark.parametrize("curvature", [-0.05, 0.0, 0.05])
+def test_a_vehicle_is_projected_wherever_a_reference_begins(curvature, passed):
+    """On a circle everything is known: a vehicle before the first point, or beyond some."""
+    places = 0.9 * jnp.arange(15.0)
+    poses = jax.vmap(lambda place: foot(curvature, place))(places)
+    points = jnp.concatenate([poses, jnp.full((15, 1), 9.0)], axis=1)
+    here = foot(curvature, jnp.asarray(passed))
+    beside = compose(here, jnp.asarray([0.0, 0.3, 0.05]))
+    state = jnp.append(beside, 9.0)
+    xi, along = projected(state, points, curvature_ahead(points))
+    np.testing.assert_allclose(xi, [0.3, 0.05, 9.0], atol=2e-3)
+    # 0.9 m before the first point the way is that of a tangent.
+    np.testing.assert_allclose(along, passed, atol=2e-2)

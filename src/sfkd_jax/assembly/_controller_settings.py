@@ -40,9 +40,9 @@ _NO_SETTINGS = (
     "model",
     "law",
     # These are for programs that build their own gate.
-    "conditions",
+    "prediction",
     "reads_env",
-    "test",
+    "tests",
     "delay",
 )
 """Arguments of controllers that are no settings."""

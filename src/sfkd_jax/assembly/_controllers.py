@@ -11,7 +11,12 @@ from sfkd_jax.assembly._controller_settings import (
     SearchSettings,
     controller_horizon,
 )
-from sfkd_jax.assembly._corridor import Corner, conditions_of, in_corridor
+from sfkd_jax.assembly._corridor import (
+    Corner,
+    conditions_of,
+    in_corridor,
+    measurement_tests,
+)
 from sfkd_jax.driving import path_following, plants
 from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.driving.path_coordinates import (
@@ -283,16 +288,24 @@ def _predicting(
     certificate: DrivingCertificate | None,
 ) -> Controller:
     """Return a controller along a path on the state at which its command will act."""
-    prediction = path_following.Prediction(
+    predictor = path_following.Predictor(
+        inner=inner,
+        prediction=_prediction(model, loop, certificate),
+        delay=loop.delay,
+    )
+    return predictor.controller()
+
+
+def _prediction(
+    model: Model, loop: _Loop, certificate: DrivingCertificate | None
+) -> path_following.Prediction:
+    """Return the prediction of a loop by a model, under the certified conditions."""
+    return path_following.Prediction(
         model=model,
         law=loop.law,
         dt=loop.plant.dt,
         conditions=conditions_of(certificate, **loop.env_box),
     )
-    predictor = path_following.Predictor(
-        inner=inner, prediction=prediction, delay=loop.delay
-    )
-    return predictor.controller()
 
 
 def _noise_to_learn_from(plant: plants.Vehicle) -> tuple[float, ...]:
@@ -327,22 +340,17 @@ def _along_reference(
     certificate: DrivingCertificate | None,
 ) -> Controller:
     """Return a controller along a path behind its gate, as one of references."""
-    corridor = certificate.corridor if certificate else None
-    test = None
-    if corridor is not None and not loop.estimates_env:
-        calibrated = corridor.innovations
-        test = path_following.innovation_test(
-            calibrated.levels, calibrated.deviation, calibrated.threshold
+    tests = path_following.MeasurementTests()
+    if certificate is not None and certificate.corridor is not None:
+        tests = measurement_tests(
+            certificate.corridor, loop.plant, estimates_env=loop.estimates_env
         )
     gate = path_following.Gate(
         inner=inner,
-        model=loop.model,
-        law=loop.law,
-        dt=loop.plant.dt,
+        prediction=_prediction(loop.model, loop, certificate),
         horizon=controller_horizon(settings, loop.delay),
-        conditions=conditions_of(certificate, **loop.env_box),
         reads_env=not loop.estimates_env,
-        test=test,
+        tests=tests,
         delay=loop.delay,
         **arguments(settings.gate, path_following.Gate),
     )

@@ -12,7 +12,7 @@ from sfkd_jax.driving import path_following, plants
 from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
 from sfkd_jax.latency import NO_LATENCY, Latency
-from sfkd_jax.types import Controller, Model
+from sfkd_jax.types import BODY, Controller, Model
 
 ROAD_MARGIN = 0.05
 """Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
@@ -87,6 +87,30 @@ def in_corridor(
         rear=_slip_of_gentle_turns(law),
         claimed=corridor.is_claimed and calibrated == latency,
     ).controller()
+
+
+def measurement_tests(
+    corridor: Corridor, plant: plants.Vehicle, *, estimates_env: bool
+) -> path_following.MeasurementTests:
+    """Return the tests of a vehicle and its sensors, as a corridor calibrated them.
+
+    Args:
+        corridor: of the policy.
+        plant: vehicle.
+        estimates_env: whether e is estimated while driving. The innovations are then
+            not those of the calibration, and are not tested.
+    """
+    noise = (*corridor.conditions.sensor_noise, 0.0, 0.0, 0.0, 0.0)
+    odometry = path_following.OdometryTest(
+        position=max(noise[:2]), speed=noise[BODY.start], dt=plant.dt
+    )
+    if estimates_env:
+        return path_following.MeasurementTests(odometry=odometry)
+    calibrated = corridor.innovations
+    innovation = path_following.innovation_test(
+        calibrated.levels, calibrated.deviation, calibrated.threshold
+    )
+    return path_following.MeasurementTests(innovation, odometry)
 
 
 def _slip_of_gentle_turns(law: path_following.PathLaw) -> float:

@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.geometry import between, wrap_angle
 from sfkd_jax.types import (
@@ -122,6 +122,51 @@ def path_coordinates(
     """
     lateral, heading = circle_errors(between(point[POSE], state[POSE]), curvature)
     return jnp.concatenate([jnp.stack([lateral, heading]), state[BODY]])
+
+
+def projected(
+    state: State,
+    points: Float[Array, "point 4"],
+    curvature: Float[Array, " point"],
+) -> tuple[PathState, Scalar]:
+    """Return ξ of a world state relative to a path, and its place on it [m].
+
+    The path is a circle up to each of its points. The vehicle is beside the circle that
+    ends at the first point which it has not passed. The place is counted from the first
+    point, and is negative before it.
+
+    Args:
+        state: pose and body state.
+        points: x, y, yaw, speed of the reference.
+        curvature: up to each point, see `curvature_ahead` [1/m].
+    """
+    end, along = place_on(state[:2], points, curvature)
+    return path_coordinates(state, points[end], curvature[end]), along
+
+
+def place_on(
+    position: Float[Array, " 2"],
+    points: Float[Array, "point 4"],
+    curvature: Float[Array, " point"],
+) -> tuple[Int[Array, ""], Scalar]:
+    """Return the first point that a position has not passed, and its place [m].
+
+    The arguments are those of `projected`.
+    """
+    pose = jnp.append(position, 0.0)
+    beside_points = jax.vmap(between, in_axes=(0, None))(points[:, POSE], pose)
+    passed = jnp.sum(jnp.cumprod(beside_points[:, 0] > 0.0))
+    end = jnp.minimum(passed, len(points) - 1)
+    # Beside a bend the same angle is a longer way outside, and a shorter one inside.
+    scale = 1.0 - curvature[end] * beside_points[end, 1]
+    ahead = beside_points[end, 0] / jnp.maximum(scale, SMALLEST_SCALE)
+    return end, lengths_along(points)[end] + ahead
+
+
+def lengths_along(points: Float[Array, "point 4"]) -> Float[Array, " point"]:
+    """Return the distance of every point of a path from the first one [m]."""
+    steps = jnp.diff(points[:, :2], axis=0)
+    return jnp.append(0.0, jnp.cumsum(jnp.hypot(steps[:, 0], steps[:, 1])))
 
 
 STANDING = 1e-3

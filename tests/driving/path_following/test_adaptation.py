@@ -52,8 +52,10 @@ def law_alone():
 def adaptive(**settings):
     options = SETTINGS | {"inner": law_alone(), "model": MODEL, "law": LAW} | settings
     adaptation = path_following.Adaptation(**options).controller()
-    about = {"model": MODEL, "law": LAW, "dt": PLANT.dt, "horizon": HORIZON}
-    gate = path_following.Gate(inner=adaptation, **about).controller()
+    prediction = path_following.Prediction(model=MODEL, law=LAW, dt=PLANT.dt)
+    gate = path_following.Gate(
+        inner=adaptation, prediction=prediction, horizon=HORIZON
+    ).controller()
     return path_following.along_reference(gate, coordinates=3)
 
 
@@ -214,8 +216,10 @@ def test_causes_are_those_of_the_command_that_acted():
     options = SETTINGS | {"model": MODEL, "law": LAW, "shrinkage": 0.0}
     inner = path_following.Adaptation(inner=inner, delay=delay, **options).controller()
     horizon = HORIZON + delay.steps
-    about = {"model": MODEL, "law": LAW, "dt": PLANT.dt, "horizon": horizon}
-    gate = path_following.Gate(inner=inner, delay=delay, **about).controller()
+    about = path_following.Prediction(model=MODEL, law=LAW, dt=PLANT.dt)
+    gate = path_following.Gate(
+        inner=inner, prediction=about, delay=delay, horizon=horizon
+    ).controller()
     controller = path_following.along_reference(gate, coordinates=3, delay=delay)
     env = jnp.asarray([0.7, 0.0])
 

@@ -84,6 +84,11 @@ def circle(curvature=0.0, horizon=HORIZON, speed=SPEED):
     return jnp.stack([*points, jnp.full(horizon, speed)], axis=1)
 
 
+def driven(xi, reference, progress):
+    """The vehicle and its reference after `progress` metres along a straight road."""
+    return vehicle_state(xi).at[0].add(progress), reference.at[:, 0].add(progress)
+
+
 def about(xi, preview):
     """What the adapter needs of a planner."""
     ahead = jnp.tile(xi, (preview.road.shape[0], 1))
@@ -109,7 +114,11 @@ def filtered(**changes):
 
 def gated(inner, **changes):
     """A controller along a path behind the gate, in the world."""
-    options = {"model": TOY, "law": LAW, "dt": 0.1, "horizon": HORIZON}
+    conditions = changes.pop("conditions", path_following.Conditions())
+    prediction = path_following.Prediction(
+        model=changes.pop("model", TOY), law=LAW, dt=0.1, conditions=conditions
+    )
+    options = {"prediction": prediction, "horizon": HORIZON}
     gate = path_following.Gate(inner=inner, **options | changes)
     return along_reference(gate.controller(), coordinates=3)
 
@@ -120,19 +129,18 @@ def drive(controller, script, disturbances, start=(0.0, 0.0, SPEED), seen=None):
     seen = jnp.ones(len(disturbances)) if seen is None else seen
 
     def step(carry, inputs):
-        xi, memory = carry
+        xi, memory, progress = carry
         disturbance, mask = inputs
-        action, memory, info = controller.act(
-            script, memory, vehicle_state(xi) * mask, env, reference
-        )
+        state, window = driven(xi, reference, progress)
+        action, memory, info = controller.act(script, memory, state * mask, env, window)
         road = jnp.asarray([0.0, SPEED])
         nu = action - LAW(xi, *road, env)
         latent = TOY.encode(env, without_pose(xi))
         after = TOY.step(env, latent, jnp.concatenate([nu, road]))
         after = TOY.decode(env, after)[BODY] + disturbance
-        return (after, memory), (xi, action, info)
+        return (after, memory, progress + 0.1 * xi[2]), (xi, action, info)
 
-    carry = (jnp.asarray(start), controller.init(jax.random.key(0)))
+    carry = (jnp.asarray(start), controller.init(jax.random.key(0)), jnp.zeros(()))
     steps = jnp.asarray(disturbances, dtype=float), seen
     return jax.lax.scan(step, carry, steps)[1]
 
@@ -332,9 +340,8 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
     xi, memory = jnp.asarray([0.1, 0.0, SPEED]), controller.init(jax.random.key(0))
     act, distances, inside = jit(controller.act), [], []
     for k in range(40):
-        action, memory, info = act(
-            quiet, memory, vehicle_state(xi), observed_envs[k], reference
-        )
+        seen, window = driven(xi, reference, 0.1 * SPEED * k)
+        action, memory, info = act(quiet, memory, seen, observed_envs[k], window)
         assert np.all(np.isfinite(action))
         distances.append(float(jnp.abs(xi - info.shield.nominal_state)[0]))
         inside.append(bool(info.env_inside))
@@ -491,10 +498,12 @@ BOX = Conditions(state=((-0.3, -0.1, 8.0), (0.3, 0.1, 10.0)))
 """Where the toy's model predicts; a step may be off by a share of half its widths."""
 
 
-def told(tamper, steps=120, disturbances=None, lag=lambda k: 0, **changes):
+def told(tamper, steps=120, disturbances=None, lag=None, begins=None, **changes):
     """True xi and info where the vehicle's state is told wrong: (observation, k) -> it,
-    or late: k -> steps.
+    or late: k -> steps; or where the reference begins elsewhere: k -> m.
     """
+    lag = lag or (lambda k: 0)
+    begins = begins or (lambda k: 0.0)
     inner = path_following.Shield(
         inner=scripted(),
         model=TOY,
@@ -513,10 +522,11 @@ def told(tamper, steps=120, disturbances=None, lag=lambda k: 0, **changes):
     def step(carry, inputs):
         (xi, past, memory), (k, push) = carry, inputs
         past = jnp.concatenate([xi[None], past[:-1]])
+        late, window = driven(past[lag(k)], circle(), 0.1 * SPEED * k)
         # The reference goes on with the vehicle: what is late lies behind.
-        late = vehicle_state(past[lag(k)]).at[0].add(-0.1 * SPEED * lag(k))
-        seen = tamper(late, k)
-        action, memory, info = controller.act(script, memory, seen, ENV, circle())
+        seen = tamper(late.at[0].add(-0.1 * SPEED * lag(k)), k)
+        window = window.at[:, 0].add(begins(k))
+        action, memory, info = controller.act(script, memory, seen, ENV, window)
         nu = action - LAW(xi, *road, ENV)
         after = A @ xi + B @ nu + jnp.asarray([0.0, 2e-4 * ENV[1], 0.1 * SPEED])
         return (after + push, past, memory), (xi, info)
@@ -537,6 +547,9 @@ FAULTS = {
     "behind": lambda o, k: o.at[:2].add(jnp.where(between(k, 40, 58), -5.0, 0.0)),
     "alternating": lambda o, k: o.at[1].add(jnp.where(k % 2 == 0, 2.0, 0.0) * (k > 40)),
     "frozen": lambda o, k: jnp.where(between(k, 40, 50), jnp.arange(4.0) / 8, o),
+    "standing still": lambda o, k: o.at[0].set(
+        jnp.where(between(k, 40, 50), 0.1 * SPEED * 39 + 0.02 * (k % 2), o[0])
+    ),
     "silent": lambda o, k: jnp.where(between(k, 40, 50), jnp.nan, o),
     "infinite": lambda o, k: jnp.where(between(k, 40, 50), jnp.inf, o),
 }
@@ -558,6 +571,37 @@ def test_what_one_step_cannot_explain_is_not_followed(name):
         assert (
             np.asarray(info.gate.measured)[lost].tolist() == [[False, True, True]] * 18
         )
+
+
+BEGINNINGS = {
+    "once 4 m ahead": lambda k: jnp.where(k == 50, 4.0, 0.0),
+    "4 m ahead from then on": lambda k: jnp.where(k >= 50, 4.0, 0.0),
+    "at way-points 5 m apart": lambda k: -jnp.mod(0.1 * SPEED * k, 5.0),
+}
+
+
+@pytest.mark.parametrize("name", BEGINNINGS)
+def test_a_reference_may_begin_anywhere(name):
+    """The place of a vehicle is known in the world, and not by its reference."""
+    xi, info = told(lambda o, k: o, begins=BEGINNINGS[name])
+    usual, _ = told(lambda o, k: o)
+    assert np.all(info.gate.measured)
+    assert np.all(info.healthy)
+    np.testing.assert_allclose(xi, usual, atol=2e-3)
+
+
+def test_in_its_own_frame_a_vehicle_does_not_stand_still():
+    """Pose 0, and a reference relative to the vehicle, as the planner of a robot has."""
+    controller = gated(scripted(), conditions=BOX)
+    act, state = jit(controller.act), controller.init(jax.random.key(0))
+    for _ in range(8):
+        seen = vehicle_state(jnp.asarray([0.0, 0.0, SPEED]))
+        _, state, info = act(jnp.zeros((8, 2)), state, seen, ENV, circle())
+        # With noise of the speed, since what repeats itself is frozen.
+        state = state._replace(
+            observations=state.observations.at[:, 3].add(1e-3),
+        )
+        assert np.all(info.gate.measured)
 
 
 def test_a_model_that_nothing_is_known_of_overrules_no_measurement():
@@ -610,7 +654,8 @@ def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause
         ),
     )
     blind = lambda o, k: jnp.where(between(k, 61, 66), jnp.nan, o)
-    _, info = told(blind, steps=160, disturbances=pushed, test=test)
+    tests = path_following.MeasurementTests(innovation=test)
+    _, info = told(blind, steps=160, disturbances=pushed, tests=tests)
     alarm = np.asarray(info.gate.alarm)
     assert not alarm[:41].any()
     assert alarm[55:66].all()
@@ -622,7 +667,7 @@ def test_an_alarm_ends_the_claim_outlasts_a_blind_sensor_and_ends_with_its_cause
 
 
 def test_who_is_blind_for_good_brakes():
-    xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=170)
+    xi, info = told(lambda o, k: jnp.where(k < 40, o, jnp.nan), steps=140)
     assert not np.any(info.healthy[40:])
     # The toy's law wants back to the old speed; the car slows down all the same.
     assert xi[-1, 2] < 6.0

@@ -72,6 +72,12 @@ from sfkd_jax.driving.path_following.wrappers._innovations import (
 from sfkd_jax.driving.path_following.wrappers._innovations import (
     turning_rate as turning_rate,
 )
+from sfkd_jax.driving.path_following.wrappers._measurement_tests import (
+    MeasurementTests as MeasurementTests,
+)
+from sfkd_jax.driving.path_following.wrappers._odometry import (
+    OdometryTest as OdometryTest,
+)
 from sfkd_jax.driving.path_following.wrappers._prediction import Periods as Periods
 from sfkd_jax.driving.path_following.wrappers._prediction import (
     Prediction as Prediction,

@@ -15,7 +15,7 @@ from sfkd_jax.latency import (
     pushed,
     rows_needed,
 )
-from sfkd_jax.types import Control
+from sfkd_jax.types import BODY, Control
 
 
 class LateState(NamedTuple):
@@ -33,16 +33,18 @@ class LateState(NamedTuple):
 class Late(NamedTuple):
     """Late sensors and actuators, between a plant and its controller.
 
-    Until the first late value arrives, the first one is observed, and the first command
-    acts at once.
+    Before the first call the vehicle drove straight on at its speed, and the first
+    command acts at once.
 
     Attributes:
         sensors: delay of every observed value, in sampling periods; () for none.
         actuators: delays of the commands.
+        dt: sampling period [s].
     """
 
     sensors: tuple[float, ...]
     actuators: CommandDelay
+    dt: float
 
     @property
     def observed_ago(self) -> int:
@@ -53,12 +55,17 @@ class Late(NamedTuple):
         """Return the state before the first call.
 
         Args:
-            values: that are observed first: a pose, and what follows it.
+            values: of the first call: pose, speed, further states, and the progress
+                along the path.
             controls: number of them.
         """
         rows = rows_needed(self.sensors)
+        moving = jnp.stack([jnp.cos(values[2]), jnp.sin(values[2])])
+        way = self.dt * values[BODY.start]
+        step = jnp.zeros_like(values).at[:2].set(way * moving).at[-1].set(way)
+        ago = jnp.arange(rows, 0, -1)[:, None]
         return LateState(
-            past=jnp.tile(values, (rows, 1)),
+            past=values - ago * step,
             sent=jnp.full((self.actuators.steps, controls), jnp.nan, dtype=float),
         )
 
@@ -87,7 +94,7 @@ def late_loop(latency: Latency, *, states: int, dt: float) -> Late:
         dt: sampling period [s].
     """
     if latency.is_none:
-        return Late((), ON_TIME)
+        return Late((), ON_TIME, dt)
     sized = latency.sized(states, 2)
     periods = sized.observation(dt)
-    return Late((*periods, periods[0]), sized.actuators(dt))
+    return Late((*periods, periods[0]), sized.actuators(dt), dt)

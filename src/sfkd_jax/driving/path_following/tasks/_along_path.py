@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from math import ceil
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from sfkd_jax.control import (
     PlanningStart,
@@ -35,25 +34,24 @@ from sfkd_jax.driving.path_coordinates import (
     beside,
     curvature_ahead,
     followable,
-    path_coordinates,
+    projected,
 )
 from sfkd_jax.driving.path_following.laws._feedback import PathErrors
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
 from sfkd_jax.driving.path_following.tasks._path_tracking import LawTask, check_path
-from sfkd_jax.geometry import (
-    between,
-    compose,
-    entrywise,
-    without_pose,
-    wrap_angle,
+from sfkd_jax.driving.path_following.tasks._preview import (
+    YAW,
+    Preview,
+    check_preview,
+    later,
 )
+from sfkd_jax.geometry import entrywise, without_pose
 from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
 from sfkd_jax.latency import ON_TIME, CommandDelay, delayed, pushed, rows_needed
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
-    POSE,
     Control,
     Controller,
     Environment,
@@ -63,75 +61,6 @@ from sfkd_jax.types import (
     Scalar,
     State,
 )
-
-YAW = 2
-"""Column of the yaw in the points of a reference."""
-
-
-class Preview(NamedTuple):
-    """The road ahead, as controllers along a path see it.
-
-    Attributes:
-        road: κ [1/m] and v_ref [m/s] of the next steps; NaN if the reference is not
-            finite.
-        along: distance along the path from the first point of the reference to the
-            observed position [m]; behind a `Gate`, to the last position that was
-            believed.
-        observation: in the world, as it came.
-        reference: in the world, as it came.
-        sent: the last commands that may still act, newest last; NaN before the first
-            one.
-        repeated: whether the observation is bit for bit the last one, like that of a
-            sensor that froze.
-        measured: which entries of ξ are measured; behind a `Gate` the others are
-            predicted.
-        on_time: whether the last call was one period ago.
-        reason: CERTIFIED if nothing in the inputs speaks against a claim, else the
-            first `Reason` that does, see `Gate`.
-    """
-
-    road: Float[Array, "horizon 2"]
-    along: Scalar
-    observation: State
-    reference: Reference
-    sent: Float[Array, "step control"]
-    repeated: Bool[Array, ""]
-    measured: Bool[Array, " coordinate"]
-    on_time: Bool[Array, ""]
-    reason: Int[Array, ""]
-
-
-def later(
-    rows: Float[Array, "step column"], periods: float, *, angle: int | None = None
-) -> Float[Array, "later column"]:
-    """Return the rows of a reference or a preview some periods later.
-
-    Between two rows they are interpolated linearly.
-
-    Args:
-        rows: one a period.
-        periods: by how many.
-        angle: column of an angle [rad], which may jump by 2π; None without one.
-    """
-    whole = ceil(periods)
-    share = whole - periods
-    after = rows[whole:]
-    if not share:
-        return after
-    gap = rows[whole - 1 : -1] - after
-    if angle is not None:
-        gap = gap.at[:, angle].set(wrap_angle(gap[:, angle]))
-    return after + share * gap
-
-
-def state_beside(xi: PathState, preview: Preview) -> State:
-    """Return the state in the world of a vehicle at ξ, beside the reference."""
-    curvature = preview.road[0, 0]
-    along = preview.along
-    left = xi[LATERAL] + 0.5 * curvature * along**2
-    motion = jnp.stack([along, left, xi[HEADING] + curvature * along])
-    pose = compose(preview.reference[0, POSE], motion)
-    return jnp.concatenate([pose, xi[PATH_SPEED:]])
 
 
 class AlongReferenceState(NamedTuple):
@@ -197,7 +126,7 @@ class AlongReference(Stateful):
         observation = delayed(observations, self.hold_back)
         points, is_followable = followable(reference)
         curvature = curvature_ahead(points)
-        xi = path_coordinates(observation, points[0], curvature[0])
+        xi, along = projected(observation, points, curvature)
         road = jnp.stack([curvature, points[:, 3]], axis=1)
         # κ can be finite where a position is not, because such points count as one.
         # A reference that cannot be trusted as a whole is NaN as a whole.
@@ -206,7 +135,7 @@ class AlongReference(Stateful):
         xi = jnp.where(readable & all_finite(observation), xi, jnp.nan)
         preview = Preview(
             road=road,
-            along=between(points[0, POSE], observation[POSE])[0],
+            along=along,
             observation=observation,
             reference=reference,
             sent=state.sent,
@@ -345,20 +274,6 @@ class FollowingLaw(LawTask):
             return PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)
 
         return errors_of(before.state), errors_of(after.state), speed
-
-
-def check_preview(xi: Any, env: Any, preview: Any, horizon: int) -> None:
-    """Raise a ValueError if there is no preview of this horizon."""
-    if not isinstance(preview, Preview):
-        raise ValueError(
-            "a planner along a path takes ξ and a `Preview`; "
-            "`along_reference` makes them of poses in the world"
-        )
-    if preview.road.shape != (horizon, 2):
-        raise ValueError(
-            f"reference must have shape ({horizon}, 4): x, y, yaw, speed; "
-            f"got {preview.road.shape[0]} steps"
-        )
 
 
 def _task(settings: FollowingLaw) -> Task:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.control import all_finite
 from sfkd_jax.driving.path_coordinates import PathState
-from sfkd_jax.driving.path_following.tasks._along_path import Preview, state_beside
+from sfkd_jax.driving.path_following.tasks._preview import Preview, state_beside
 from sfkd_jax.info import ControllerInfo, reported
 from sfkd_jax.rollout import Offset
 from sfkd_jax.types import Control, Controller, Params

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.control import Stateful
 from sfkd_jax.driving.path_coordinates import LATERAL, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
-from sfkd_jax.driving.path_following.tasks._along_path import Preview
+from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._estimator import (
     CAUSES,
     FRICTION,

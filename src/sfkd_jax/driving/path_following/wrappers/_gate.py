@@ -13,21 +13,23 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control import Stateful, all_finite
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
-from sfkd_jax.driving.path_following.laws._path_law import PathLaw
-from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
-from sfkd_jax.driving.path_following.tasks._along_path import Preview, check_preview
-from sfkd_jax.driving.path_following.wrappers._conditions import ANYWHERE, Conditions
+from sfkd_jax.driving.path_following.tasks._preview import (
+    Preview,
+    check_preview,
+    road_from,
+    state_beside,
+)
 from sfkd_jax.driving.path_following.wrappers._estimator import input_error
 from sfkd_jax.driving.path_following.wrappers._innovations import (
     InnovationState,
-    InnovationTest,
-    expected_coordinates,
     turning_rate,
+)
+from sfkd_jax.driving.path_following.wrappers._measurement_tests import (
+    MeasurementTests,
 )
 from sfkd_jax.driving.path_following.wrappers._plausibility import (
     LATEST,
@@ -36,28 +38,25 @@ from sfkd_jax.driving.path_following.wrappers._plausibility import (
     Plausibility,
     difference,
 )
-from sfkd_jax.geometry import put
+from sfkd_jax.driving.path_following.wrappers._prediction import Prediction
 from sfkd_jax.info import ControllerInfo, GateInfo, Reason, first, reported
 from sfkd_jax.latency import ON_TIME, CommandDelay
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, check_intervals
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
+    POSE,
     Control,
     Controller,
     Environment,
-    Fiber,
     Key,
-    Model,
     Params,
     Scalar,
 )
 
+NO_TESTS = MeasurementTests()
+"""No test: nothing raises an alarm."""
 SLOWING = 0.8
 """Speed [m/s] by which the reference of a lost vehicle is below the vehicle's speed."""
-OUTSIDE = 0.5
-"""Distance outside the box of ξ up to which the model predicts a car that is not seen,
-as a share of the width of the box.
-"""
 
 
 class Inputs(NamedTuple):
@@ -87,25 +86,19 @@ class Inputs(NamedTuple):
         )
 
 
-class Tested(NamedTuple):
-    """The outcome of the test of the innovations, see `InnovationTest`."""
-
-    state: InnovationState | None  # None without a test
-    statistic: Scalar  # NaN without a test
-    alarm: Bool[Array, ""]
-
-
 class Expected(NamedTuple):
     """What is expected of the next step.
 
     Attributes:
         xi: predicted ξ.
         modelled: whether the model predicted it, inside the conditions.
+        place: predicted position in the world [m].
         test: state of the test, with what the next measurement is compared with.
     """
 
     xi: PathState
     modelled: Bool[Array, ""]
+    place: Float[Array, " 2"]
     test: InnovationState | None
 
 
@@ -119,16 +112,20 @@ class Gate(Stateful):
     A coordinate is replaced by ξ⁻ if it does not pass, is not finite, or belongs to an
     observation that repeats the last one bit for bit while the vehicle moves. The
     vehicle then drives on its nominal model, with the other coordinates measured. Of
-    the yaw of a wrong pose the changes are still used. An observation that lies behind
-    on the path, where the vehicle was up to 1.2 s ago, is late. It corrects the
-    estimates since then.
+    the yaw of a wrong pose the changes are still used.
+
+    The place along the path is predicted from the speed, in the world, so a position
+    that stands still or jumps along the path does not pass either, while a reference
+    may begin anywhere. `inner` is shown the road from the believed place on. An
+    observation that lies behind on the path, where the vehicle was up to 1.2 s ago, is
+    late. It corrects the estimates since then.
 
     After `patience` a finite measurement is believed, whatever it says, and the
     certificate is not claimed for a `trial`. If there is none, or there have been late
     ones for 6 s, the reference speed falls, and the vehicle stops.
 
     Outside the conditions the limits are what a vehicle can reach. Far outside them,
-    and without a box of ξ, ξ⁻ is that of a point that keeps its heading and speed.
+    and without a box of ξ, ξ⁻ is that of a steady turn at this speed and steering.
 
     An environment or reference that is not finite is replaced by the last one, and by
     the middle of the box of e before the first one. The road moves on with every step.
@@ -140,13 +137,10 @@ class Gate(Stateful):
 
     Attributes:
         inner: controller along a path.
-        model: of the closed loop, in path coordinates.
-        law: around which the model was learned.
-        dt: sampling period [s].
-        conditions: where the model predicts.
+        prediction: of the closed loop, around whose law the model was learned.
         horizon: number of steps of the preview.
         reads_env: whether `inner` reads the environment that it is given.
-        test: of the innovations; it takes into account what `inner` estimates.
+        tests: that raise alarms.
         delay: of the commands after an observation.
         patience: longest time on the nominal model [s].
         trial: time without a claim after an implausible measurement was believed [s].
@@ -156,13 +150,10 @@ class Gate(Stateful):
     """
 
     inner: Controller
-    model: Model
-    law: PathLaw
-    dt: Positive
+    prediction: Prediction
     horizon: AtLeastOne
-    conditions: Conditions = ANYWHERE
     reads_env: bool = True
-    test: InnovationTest | None = None
+    tests: MeasurementTests = NO_TESTS
     delay: CommandDelay = ON_TIME
     patience: Positive = 2.0
     trial: Positive = 10.0
@@ -175,22 +166,24 @@ class Gate(Stateful):
 
     def init(self, key: Key) -> GateState:
         """Return the state before the first control step."""
-        size = self.law.gain.shape[-1]
-        box = self.conditions.env
+        law = self.prediction.law
+        size = law.gain.shape[-1]
+        box = self.prediction.conditions.env
         if box is None:
-            box = (self.law.low[2:], self.law.high[2:])
+            box = (law.low[2:], law.high[2:])
+        steps = round(LATEST / self.prediction.dt)
         return GateState(
             inner=self.inner.init(key),
             expected=jnp.full(size, jnp.nan, dtype=float),
             modelled=jnp.asarray(False),
-            along=jnp.full((), jnp.nan, dtype=float),
+            place=jnp.full(2, jnp.nan, dtype=float),
             missing=jnp.zeros(size, jnp.int32),
             skew=jnp.zeros(()),
             doubt=jnp.zeros((), jnp.int32),
             env=0.5 * jnp.sum(jnp.asarray(box, dtype=float), axis=0),
             road=jnp.zeros((self.horizon, 2)),
-            test=None if self.test is None else self.test.init(),
-            past=jnp.full((round(LATEST / self.dt), size + 1), jnp.nan, dtype=float),
+            tests=self.tests.init(states=size + 1),
+            past=jnp.full((steps, size + 1), jnp.nan, dtype=float),
         )
 
     def act(
@@ -207,16 +200,22 @@ class Gate(Stateful):
         preview = inputs.preview
         believed = self._plausibility.judge(state, inputs.xi, preview, inputs.periods)
         measured = believed.measured
-        tested = self._tested(state, inputs, measured)
+        tests, statistic, alarm = self.tests.update(
+            state.tests,
+            inputs.xi,
+            preview.observation,
+            jnp.all(measured) & preview.on_time,
+        )
         reason = first(
             inputs.reason,
             (~jnp.all(measured), Reason.NOT_MEASURED),
-            (tested.alarm, Reason.ALARM),
+            (alarm, Reason.ALARM),
             (believed.state.doubt > 0, Reason.TRIAL),
         )
-        road = self._slowed(preview.road, believed.xi[PATH_SPEED], believed.lost)
+        road = road_from(preview, believed.along)
+        road = self._slowed(road, believed.xi[PATH_SPEED], believed.lost)
         shown = preview._replace(
-            road=road, along=believed.state.along, measured=measured, reason=reason
+            road=road, along=believed.along, measured=measured, reason=reason
         )
         control, inner, info = self.inner.act(
             params, state.inner, believed.xi, inputs.env, shown
@@ -224,7 +223,7 @@ class Gate(Stateful):
         info = reported(info)
         acting = self.delay.acting(preview.sent, control)
         expected = self._expect(
-            params, inputs, believed, road, acting, info, tested.state
+            params, inputs, believed, shown, acting, info, tests.innovation
         )
         innovation = difference(inputs.xi, state.expected)
         info = info._replace(
@@ -233,18 +232,19 @@ class Gate(Stateful):
             gate=GateInfo(
                 measured=measured,
                 innovation=jnp.where(measured, innovation, jnp.nan),
-                statistic=tested.statistic,
-                alarm=tested.alarm,
+                statistic=statistic,
+                alarm=alarm,
             ),
         )
         after = believed.state._replace(
             inner=inner,
             expected=expected.xi,
             modelled=expected.modelled,
+            place=expected.place,
             doubt=jnp.maximum(believed.state.doubt - 1, 0),
             env=inputs.env,
             road=road,
-            test=expected.test,
+            tests=tests._replace(innovation=expected.test),
         )
         return control, after, info
 
@@ -252,8 +252,8 @@ class Gate(Stateful):
     def _plausibility(self) -> Plausibility:
         """The rules by which a measurement is believed."""
         return Plausibility(
-            dt=self.dt,
-            box=self.conditions.state,
+            dt=self.prediction.dt,
+            box=self.prediction.conditions.state,
             patience=self.patience,
             trial=self.trial,
             share=self.share,
@@ -295,22 +295,12 @@ class Gate(Stateful):
             env_known=env_known,
         )
 
-    def _tested(
-        self, state: GateState, inputs: Inputs, measured: Bool[Array, " coordinate"]
-    ) -> Tested:
-        """Return the outcome of the test, which reads complete measurements alone."""
-        if self.test is None or state.test is None:
-            return Tested(None, jnp.asarray(jnp.nan), jnp.asarray(False))
-        used = measured & jnp.all(measured) & inputs.preview.on_time
-        after, statistic = self.test.update(state.test, inputs.xi, used)
-        return Tested(after, statistic, after.alarm)
-
     def _expect(
         self,
         params: Params,
         inputs: Inputs,
         believed: Believed,
-        road: Float[Array, "preview 2"],
+        shown: Preview,
         control: Control,
         info: ControllerInfo,
         test: InnovationState | None,
@@ -321,73 +311,49 @@ class Gate(Stateful):
             params: of the model.
             inputs: of this step.
             believed: of the measurement.
-            road: that the controller was shown.
+            shown: to the controller.
             control: that acts over the period after the measurement.
             info: of the controller; an estimator says in it what it estimates.
             test: state of the test of the innovations; None without one.
         """
-        here = road[0]
+        predict = self.prediction
+        here = shown.road[0]
         env = inputs.env
         # What acts is the control and the input error that an estimator counteracts.
         acting = control
         if info.adaptation is not None:
             env = info.adaptation.env
             acting = control + input_error(info.adaptation.causes, here)
-        nearest = self.conditions.nearest(env)
-        turn = self.law.turn(here[0], here[1], nearest)
+        nearest = predict.conditions.nearest(env)
+        turn = predict.law.turn(here[0], here[1], nearest)
         fiber = None
-        if self.conditions.state is not None:
-            fiber = self.model.fiber(fold(self.model, params), nearest)
+        # A model of which nothing is known must not overrule a measurement.
+        if predict.conditions.state is not None:
+            fiber = predict.model.fiber(fold(predict.model, params), nearest)
         # From the estimate, for the next step; and from ξ as it is, for the test.
+        estimate = believed.state.past[0, :-1]
         xi = believed.xi
         unseen = ~believed.measured[LATERAL]
-        after, inside, usual = jax.vmap(partial(self._onward, fiber, turn, here))(
-            jnp.stack([believed.state.past[0, :-1], xi]),
+        after = jax.vmap(partial(predict.onward, fiber, turn, here))(
+            jnp.stack([estimate, xi]),
             jnp.stack([control, acting]),
             jnp.stack([unseen, jnp.asarray(False)]),
         )
         if test is not None:
-            rate = turning_rate(self.law, xi, acting, here, nearest)
-            ahead = jnp.append(after[1], xi[HEADING] + self.dt * rate)
+            rate = turning_rate(predict.law, xi, acting, here, nearest)
+            ahead = jnp.append(after.xi[1], xi[HEADING] + predict.dt * rate)
             clear = inputs.reason == Reason.CERTIFIED
             clear = clear & jnp.all(believed.measured)
-            comparable = clear & inside[1] & usual[1]
+            comparable = clear & after.inside[1] & after.usual[1]
             test = test._replace(
                 expected=jnp.where(comparable, ahead, jnp.nan), level=turn.level
             )
-        return Expected(after[0], inside[0], test)
-
-    def _onward(
-        self,
-        fiber: Fiber,
-        turn: SteadyTurn,
-        road: Float[Array, " 2"],
-        xi: PathState,
-        control: Control,
-        unseen: Bool[Array, ""],
-    ) -> tuple[PathState, Bool[Array, ""], Bool[Array, ""]]:
-        """Predict ξ one step later.
-
-        Returns:
-            ξ; whether the model says so, inside the conditions; whether the control
-            differs from the law by no more than data and planners add to it. Beyond
-            that no model was learned.
-        """
-        nu = control - turn.feedback(xi)
-        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
-        sideways = self.dt * xi[PATH_SPEED] * jnp.sin(xi[HEADING])
-        straight = put(xi, LATERAL, xi[LATERAL] + sideways)
-        if self.conditions.state is None:
-            # A model that nothing is known of must not overrule a measurement.
-            return straight, jnp.asarray(False), usual
-        ahead = expected_coordinates(self.model, fiber, xi, nu, road)
-        inside = self.conditions.hold(xi, road) & all_finite(ahead)
-        # A car that is not seen drives on its model somewhat outside as well: a point
-        # that keeps its heading would be worse.
-        low, high = map(np.asarray, self.conditions.state)
-        more = OUTSIDE * (high - low)
-        near = jnp.all((low - more <= xi) & (xi <= high + more)) & all_finite(ahead)
-        return jnp.where(inside | (unseen & near), ahead, straight), inside, usual
+        onward = shown._replace(along=believed.along + predict.way(estimate, here))
+        place = state_beside(after.xi[0], onward)[:2]
+        # In its own frame a vehicle does not move.
+        moves = jnp.any(shown.observation[POSE] != 0.0)
+        place = jnp.where(moves, place, jnp.nan)
+        return Expected(after.xi[0], after.inside[0], place, test)
 
 
 def _elapsed(state: Any) -> Scalar:

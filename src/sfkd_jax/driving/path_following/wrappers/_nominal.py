@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool
 
 from sfkd_jax.control import all_finite
 from sfkd_jax.driving.path_coordinates import LATERAL, PathState
-from sfkd_jax.driving.path_following.tasks._along_path import Preview
+from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._conditions import Conditions
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.rollout import fold

@@ -11,10 +11,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.control import all_finite
-from sfkd_jax.driving.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
-from sfkd_jax.driving.path_following.tasks._along_path import Preview
+from sfkd_jax.driving.path_coordinates import (
+    HEADING,
+    LATERAL,
+    PATH_SPEED,
+    PathState,
+    curvature_ahead,
+    place_on,
+)
+from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._conditions import Box
-from sfkd_jax.driving.path_following.wrappers._innovations import InnovationState
+from sfkd_jax.driving.path_following.wrappers._measurement_tests import TestsState
 from sfkd_jax.geometry import put, wrap_angle
 from sfkd_jax.types import Environment, Scalar
 
@@ -24,6 +31,14 @@ PATIENCE_AHEAD = 6.0
 """Longest time on observations from another place of the path, or without them [s]."""
 LATEST = 1.2
 """Largest delay of an observation that is recognised [s]."""
+SLIP = 0.3
+"""Share of the way of a step by which a position may be ahead or behind."""
+ALONG_NOISE = 0.2
+"""Distance along the path by which it may be so besides [m]."""
+ALONG_GAIN = 0.2
+"""Gain of the place along the path. It is small, so that small contradictions between
+position and speed add up.
+"""
 AS_LATE = 0.5
 """Share of the limits by which a late observation may differ from the estimate of its
 time. A wrong position is behind on the path as well, and rarely that close.
@@ -37,7 +52,8 @@ class GateState(NamedTuple):
         inner: state of the wrapped controller.
         expected: ξ predicted for this step; NaN before the first measurement.
         modelled: whether the model predicted it, inside the conditions.
-        along: distance along the path of the last measured position, see `Preview`.
+        place: position in the world predicted for this step [m]; NaN before the first
+            measurement, and in the frame of the vehicle.
         missing: number of steps since each coordinate was last used.
         skew: what a wrong pose adds to the relative yaw [rad]; 0 for a right one.
         doubt: number of steps until the certificate may be claimed again, after a
@@ -45,20 +61,20 @@ class GateState(NamedTuple):
         env: the last finite environment.
         road: κ [1/m] and v_ref [m/s] over the next steps of the last finite reference;
             0 before the first one.
-        test: state of the test of the innovations, or None.
+        tests: state of the tests that raise alarms.
         past: estimates of ξ at the last steps, newest first, and κ there [1/m].
     """
 
     inner: Any
     expected: PathState
     modelled: Bool[Array, ""]
-    along: Scalar
+    place: Float[Array, " 2"]
     missing: Int[Array, " coordinate"]
     skew: Scalar
     doubt: Int[Array, ""]
     env: Environment
     road: Float[Array, "preview 2"]
-    test: InnovationState | None
+    tests: TestsState
     past: Float[Array, "step coordinate+1"]
 
 
@@ -68,12 +84,14 @@ class Believed(NamedTuple):
     Attributes:
         xi: ξ, measured where that is believed, and elsewhere predicted.
         measured: which entries of ξ are measured.
+        along: place on the path, see `Preview`.
         lost: whether there has been nothing to believe for too long.
         state: of the gate, with what follows from the measurement.
     """
 
     xi: PathState
     measured: Bool[Array, " coordinate"]
+    along: Scalar
     lost: Bool[Array, ""]
     state: GateState
 
@@ -138,14 +156,17 @@ class Plausibility:
         moving = jnp.abs(expected[PATH_SPEED]) > MOVING
         seen = jnp.isfinite(observed) & ~(preview.repeated & moving)
 
-        # The path goes on under the vehicle: an observation that is suddenly ahead or
-        # behind is of another time or place, in all of its entries.
-        gap = preview.along - state.along
-        shifted = (jnp.abs(gap) > self._reach(state, periods)) & moving
+        # An observation that is ahead of where the vehicle has driven, or behind, is of
+        # another time or place, in all of its entries.
+        points = preview.reference
+        _, along = place_on(state.place, points, curvature_ahead(points))
+        gap = preview.along - along
+        slack = self._slack(state, periods, preview.on_time)
+        shifted = (jnp.abs(gap) > slack) & moving
         earlier = self._earlier(state, observed, preview.road[0, 0], gap)
         late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
         late &= preview.on_time & shifted
-        # Not for ever: the reference may have moved, and the car has stopped by then.
+        # Not for ever: the vehicle may have slid, and has stopped by then.
         longest = round(PATIENCE_AHEAD / self.dt)
         usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
 
@@ -172,15 +193,19 @@ class Plausibility:
         estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
         here = jnp.append(estimate, preview.road[0, 0])
         past = jnp.where(late, earlier.past, state.past)
+        seen_along = jnp.all(measured)
+        # What is believed although it is far off starts anew.
+        gain = jnp.where(shifted, 1.0, ALONG_GAIN)
+        along = along + gain * jnp.where(seen_along, gap, 0.0)
+        along = jnp.where(jnp.isfinite(along), along, preview.along)
         after = state._replace(
-            along=jnp.where(jnp.all(measured), preview.along, state.along),
             missing=missing,
             skew=jnp.where(skewed, skew, 0.0),
             doubt=jnp.where(forced, round(self.trial / self.dt), state.doubt),
             past=jnp.concatenate([here[None], past[:-1]]),
         )
         lost = jnp.any((missing > longest) & ~usable)
-        return Believed(xi, measured, lost, after)
+        return Believed(xi, measured, along, lost, after)
 
     def _skew(self, before: Scalar, innovation: Scalar, limit: Scalar) -> Scalar:
         """Return by which angle a wrong yaw is wrong [rad].
@@ -200,8 +225,7 @@ class Plausibility:
             state: of the gate after the last step.
             xi: observed ξ.
             curvature: of the path here [1/m].
-            gap: from the last measured position to the observed one, along the path
-                [m].
+            gap: from the predicted position to the observed one, along the path [m].
         """
         past = state.past[:, :-1]
         curvatures = state.past[:, -1]
@@ -232,6 +256,16 @@ class Plausibility:
             difference_now=after(behind[which]),
             past=jnp.concatenate([corrected, curvatures[:, None]], axis=1),
         )
+
+    def _slack(
+        self, state: GateState, periods: Scalar, on_time: Bool[Array, ""]
+    ) -> Scalar:
+        """Return how far a position may be ahead or behind along the path [m]."""
+        way = jnp.abs(state.expected[PATH_SPEED]) * self.dt
+        # Between calls that are not one period apart the way is not known.
+        share = jnp.where(on_time, SLIP, 1.0 + SLIP) * jnp.maximum(periods, 1.0)
+        unseen = 1.0 + self.growth * jnp.max(state.missing)
+        return (share * way + ALONG_NOISE) * unseen
 
     def _reach(self, state: GateState, periods: Scalar) -> Scalar:
         """Return how far the vehicle gets in a step, and somewhat more [m]."""

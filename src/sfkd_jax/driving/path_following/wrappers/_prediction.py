@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.control import Stateful, all_finite
 from sfkd_jax.driving.path_coordinates import (
@@ -18,10 +18,11 @@ from sfkd_jax.driving.path_coordinates import (
     PATH_SPEED,
     SMALLEST_SCALE,
     PathState,
+    lengths_along,
 )
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
-from sfkd_jax.driving.path_following.tasks._along_path import (
+from sfkd_jax.driving.path_following.tasks._preview import (
     YAW,
     Preview,
     later,
@@ -43,6 +44,26 @@ from sfkd_jax.types import (
     Params,
     Scalar,
 )
+
+OUTSIDE = 0.5
+"""Distance outside the box of ξ up to which the model predicts a vehicle that is not
+seen, as a share of the width of the box.
+"""
+
+
+class Onward(NamedTuple):
+    """What is predicted of one step.
+
+    Attributes:
+        xi: ξ one step later.
+        inside: whether the model says so, inside the conditions.
+        usual: whether the control differs from the law by no more than data and
+            planners add to it. Beyond that no model was learned.
+    """
+
+    xi: PathState
+    inside: Bool[Array, ""]
+    usual: Bool[Array, ""]
 
 
 class Periods(NamedTuple):
@@ -111,17 +132,55 @@ class Prediction:
             turn = self.law.turn(period.road[0], period.road[1], env)
             feedback = turn.feedback(xi)
             control = jnp.where(jnp.isnan(period.control), feedback, period.control)
-            after = expected_coordinates(
-                self.model, fiber, xi, control - feedback, period.road
-            )
-            along = self.dt * _progress(xi, period.road)
-            coasting = self._turning(turn, xi, control, period.road, along)
-            inside = self.conditions.hold(xi, period.road) & all_finite(after)
-            step = difference(jnp.where(inside, after, coasting), xi)
-            return xi + period.share * step, period.share * along
+            after = self.onward(fiber, turn, period.road, xi, control).xi
+            way = self.way(xi, period.road)
+            step = difference(after, xi)
+            return xi + period.share * step, period.share * way
 
         xi, distances = jax.lax.scan(advance, xi, periods)
         return xi, jnp.sum(distances)
+
+    def onward(
+        self,
+        fiber: Fiber,
+        turn: SteadyTurn,
+        road: Float[Array, " 2"],
+        xi: PathState,
+        control: Control,
+        unseen: Bool[Array, ""] | bool = False,
+    ) -> Onward:
+        """Predict ξ one step later.
+
+        Args:
+            fiber: of the model; None if nothing is known of the model.
+            turn: the steady turn on this road.
+            road: κ [1/m] and v_ref [m/s].
+            xi: now.
+            control: that acts.
+            unseen: whether ξ is itself predicted.
+        """
+        nu = control - turn.feedback(xi)
+        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+        coasting = self._turning(turn, xi, control, road)
+        if fiber is None:
+            return Onward(coasting, jnp.asarray(False), usual)
+        after = expected_coordinates(self.model, fiber, xi, nu, road)
+        finite = all_finite(after)
+        inside = self.conditions.hold(xi, road) & finite
+        believed = inside
+        if self.conditions.state is not None:
+            # A vehicle that is not seen drives on its model somewhat outside as well:
+            # a steady turn would be worse.
+            low, high = map(np.asarray, self.conditions.state)
+            more = OUTSIDE * (high - low)
+            near = jnp.all((low - more <= xi) & (xi <= high + more)) & finite
+            believed = inside | (unseen & near)
+        return Onward(jnp.where(believed, after, coasting), inside, usual)
+
+    def way(self, xi: PathState, road: Float[Array, " 2"]) -> Scalar:
+        """Return the way along the path in one step [m], Δt v cos e_ψ / (1 − κ e_y)."""
+        scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], SMALLEST_SCALE)
+        return self.dt * xi[PATH_SPEED] * jnp.cos(xi[HEADING]) / scale
 
     def _turning(
         self,
@@ -129,21 +188,14 @@ class Prediction:
         xi: PathState,
         control: Control,
         road: Float[Array, " 2"],
-        along: Scalar,
     ) -> PathState:
         """Return ξ one step later of a vehicle that keeps its speed and curvature."""
-        bend = turn.grip[0]
-        turned = self.dt * xi[PATH_SPEED] * control[0] / bend - road[0] * along
+        path_turned = road[0] * self.way(xi, road)
+        turned = self.dt * xi[PATH_SPEED] * control[0] / turn.grip[0] - path_turned
         middle = xi[HEADING] + 0.5 * turned
         sideways = self.dt * xi[PATH_SPEED] * jnp.sin(middle)
         after = put(xi, LATERAL, xi[LATERAL] + sideways)
         return put(after, HEADING, xi[HEADING] + turned)
-
-
-def _progress(xi: PathState, road: Float[Array, " 2"]) -> Scalar:
-    """Return ds/dt = v cos e_ψ / (1 − κ e_y) [m/s]."""
-    scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], SMALLEST_SCALE)
-    return xi[PATH_SPEED] * jnp.cos(xi[HEADING]) / scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +240,8 @@ class Predictor(Stateful):
         ahead, distance = predict.ahead(fiber, nearest, xi, periods)
         first = self.delay.first
         reference = later(preview.reference, first, angle=YAW)
-        passed = _way(preview.reference, first)
+        rows = jnp.arange(len(preview.reference))
+        passed = jnp.interp(first, rows, lengths_along(preview.reference))
         shown = preview._replace(
             road=later(preview.road, first),
             reference=reference,
@@ -196,10 +249,3 @@ class Predictor(Stateful):
         )
         shown = shown._replace(observation=state_beside(ahead, shown))
         return self.inner.act(params, state, ahead, env, shown)
-
-
-def _way(points: Float[Array, "horizon 4"], periods: float) -> Scalar:
-    """Return the distance from the first point to the one some periods later [m]."""
-    gaps = jnp.diff(points[:, :2], axis=0)[: ceil(periods)]
-    share = np.clip(periods - np.arange(len(gaps)), 0.0, 1.0)
-    return jnp.sum(share * jnp.hypot(gaps[:, 0], gaps[:, 1]))

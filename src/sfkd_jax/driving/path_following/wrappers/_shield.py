@@ -21,7 +21,7 @@ from sfkd_jax.control import Stateful, all_finite
 from sfkd_jax.driving.path_coordinates import HEADING, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.driving.path_following.laws._feedback import holding
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
-from sfkd_jax.driving.path_following.tasks._along_path import Preview
+from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._conditions import (
     ANYWHERE,
     Box,
