@@ -49,7 +49,7 @@ DRIVING = {
     "driving.scenarios": ROAD,
     "driving.path_following": ROAD | {"control"},
     "driving.drives": PLANT | {"data", "store"},
-    "driving.logs": PLANT | {"data", "store"},
+    "driving.logs": PLANT | {"data", "store", "driving.path_following"},
     "driving.simulation": PLANT | {"evaluation"},
     "driving.certificate": {"ranges", "store", "certificate", "latency"},
     "driving.corridor": PLANT

@@ -14,7 +14,7 @@ from composing import run, settings
 from helpers import last_line, run_command
 
 import sfkd_jax
-from sfkd_jax import assembly, collect, evaluate
+from sfkd_jax import assembly, collect, evaluate, generate
 from sfkd_jax.certificate import write
 from sfkd_jax.driving import plants
 from sfkd_jax.experiment import identified
@@ -110,6 +110,9 @@ def test_logs_are_stored_with_their_coverage_and_only_test_runs_are_held_out(
     assert set(source.held_out) == {"test"}
     assert source.held_out["test"] is dataset.test
     covered = json.loads((source.path.parent / "coverage.json").read_text())
+    lags = generate.main(run(*SMALL))["command_lags"]
+    # Samples of a smooth command, half a period early as commands that are held.
+    assert lags["steering"]["low_s"] <= -0.05 <= lags["steering"]["high_s"]
     assert set(covered["state"]) == {"v", "yaw_rate"}
     assert 4.0 <= covered["state"]["v"]["low"] < covered["state"]["v"]["high"] <= 6.0
 

@@ -36,12 +36,8 @@ def main(run: Run) -> dict[str, Any]:
     if certificate is None or trained.law is None or corridor is None:
         reason = reason or "its certificate has no corridor"
         raise ValueError(f"{folder}: nothing to calibrate again, {reason}")
-    if not corridor.conditions.latency.is_none:
-        raise ValueError(
-            f"{folder}: runs with latency are not calibrated on yet: a row has the "
-            "command that was sent, and not the one that acted"
-        )
-    runs, contents = recorded_runs(run.settings.collect.path, trained)
+    latency = corridor.conditions.latency
+    runs, contents = recorded_runs(run.settings.collect.path, trained, latency)
     count, steps = runs.controls.shape[:2]
     seconds = steps * trained.vehicle.dt
     check_count(count, level, "runs")

@@ -14,11 +14,13 @@ def main(run: Run) -> dict[str, Any]:
     """Make the data set, unless it is stored already."""
     began = time.perf_counter()
     dataset = run.source.dataset
-    return {
+    made = {
         "dataset": str(run.source.path),
         "segments": sum(len(getattr(dataset, part).controls) for part in PARTS),
         "seconds": time.perf_counter() - began,
     }
+    lags = run.source.command_lags
+    return {**made, "command_lags": lags} if lags else made
 
 
 if __name__ == "__main__":

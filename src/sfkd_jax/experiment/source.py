@@ -25,6 +25,9 @@ from sfkd_jax.experiment.options import (
 from sfkd_jax.settings import replace
 from sfkd_jax.types import Trajectory
 
+COMMAND_LAGS = "command_lags.json"
+"""File beside the data set of logs that says how late each command acts."""
+
 
 @dataclass(frozen=True, eq=False)
 class DataSource:
@@ -143,8 +146,14 @@ class DataSource:
             logged=self.logs is not None,
         )
 
+    @property
+    def command_lags(self) -> dict[str, Any]:
+        """How late each command acts in the logs of the data set; {} without logs."""
+        path = self.path.with_name(COMMAND_LAGS)
+        return store.read_json(path) if path.is_file() else {}
+
     def _make(self) -> Dataset:
-        """Return a new data set; of logs, what it covers is written beside it."""
+        """Return a new data set; what was found of logs is written beside it."""
         if self.logs is None:
             self.check_plant()
             return data.simulate(
@@ -155,6 +164,8 @@ class DataSource:
             )
         logged = identified.read(self.plant, self.environment, self.logs)
         store.write_json(self.path.with_name("coverage.json"), logged.coverage)
+        lags = {name: lag._asdict() for name, lag in logged.command_lags.items()}
+        store.write_json(self.path.with_name(COMMAND_LAGS), lags)
         return logged.dataset
 
     def _drive(self, *, switching: bool = False, **changes: int) -> data.Drive:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from sfkd_jax.data import PARTS, Dataset, coverage, environment_box
 from sfkd_jax.driving.logs._checks import Bounds, Checks
+from sfkd_jax.driving.logs._command_lags import CommandLag, command_lags
 from sfkd_jax.driving.logs._findings import Finding
 from sfkd_jax.driving.logs._joint_checks import check_together
 from sfkd_jax.driving.logs._log_files import log_files
@@ -31,10 +32,17 @@ Coverage: TypeAlias = dict[str, dict[str, dict[str, float]]]
 
 
 class LoggedDataset(NamedTuple):
-    """A data set of recorded runs, and how well its segments cover every channel."""
+    """A data set of recorded runs, and what was found of them.
+
+    Attributes:
+        dataset: of their segments.
+        coverage: how well the segments cover every channel.
+        command_lags: how late each command acts, by its name.
+    """
 
     dataset: Dataset
     coverage: Coverage
+    command_lags: dict[str, CommandLag]
 
 
 def from_logs(
@@ -97,6 +105,9 @@ def from_logs(
         box=box,
     )
     logs = _checked_logs(path, checks, needs_environment, report)
+    lags = command_lags(checks, logs)
+    found = ", ".join(lag.line(name) for name, lag in lags.items())
+    report(f"{found}: latency and lag of the actuators together")
     cut, runs = segments([list(pieces(log, dt, gap)) for log in logs], steps)
     parts, whole_runs = assign_parts(runs, shares=shares, seed=seed)
     _report_sizes(logs, parts, steps, dt, report)
@@ -111,7 +122,7 @@ def from_logs(
     environment = columns.environment if needs_environment else ()
     covered = _coverage(cut, columns, environment)
     _report_coverage(covered, report)
-    return LoggedDataset(dataset, covered)
+    return LoggedDataset(dataset, covered, lags)
 
 
 def _checked_logs(

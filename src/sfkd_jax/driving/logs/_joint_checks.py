@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, Shaped
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sfkd_jax.driving.logs._checks import Checks
+from sfkd_jax.driving.logs._command_lags import speed_tables, yaw_tables
 from sfkd_jax.driving.logs._comparisons import compare, turns
 from sfkd_jax.driving.logs._findings import Finding, more, warning
 from sfkd_jax.driving.logs._logs import Log
@@ -186,23 +187,13 @@ def _commands(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
 
 
 def _yaw_delay(checks: Checks, logs: list[Log], control: int) -> Delay:
-    """Return the delay of yaw behind a command, times speed: a turn is faster then."""
-    tables = []
-    for log in logs:
-        rate = log.controls[:, control] * log.states[:, 3]
-        table = np.column_stack([log.time, np.unwrap(log.states[:, 2]), rate])
-        tables += [table[rows] for rows in log.parts(checks.gap, checks.dt)]
-    return find_delay(tables, held=True)
+    """Return the delay of yaw behind a command."""
+    return find_delay(yaw_tables(checks, logs, control), held=True)
 
 
 def _speed_delay(checks: Checks, logs: list[Log], control: int) -> Delay:
     """Return the delay of the speed behind a command."""
-    tables = []
-    for log in logs:
-        rate = log.controls[:, control]
-        table = np.column_stack([log.time, log.states[:, 3], rate])
-        tables += [table[rows] for rows in log.parts(checks.gap, checks.dt)]
-    return find_delay(tables, held=True)
+    return find_delay(speed_tables(checks, logs, control), held=True)
 
 
 def _repeats(checks: Checks, logs: list[Log]) -> Iterator[Finding]:

@@ -23,6 +23,10 @@ ZERO_LAG = LAGS // 2
 """Index of the delay 0."""
 FEWEST_CHORDS = 20
 """Number of chords that an estimate of a delay needs."""
+CERTAIN = 10.0
+"""Log-likelihood ratio from which on one of two delays is no matter of chance."""
+QUANTILE = 1.92
+"""Half of the 95 % quantile of χ² with one degree of freedom."""
 
 
 class Chords(NamedTuple):
@@ -112,6 +116,89 @@ class Delay(NamedTuple):
         )
 
 
+class Profile(NamedTuple):
+    """How well a motion agrees with a rate that is delayed, by every delay.
+
+    The delays are `LAGS` between −`LARGEST_LAG` and `LARGEST_LAG`.
+
+    Attributes:
+        count: number of chords.
+        gains: of the motion over the integrated rate.
+        fit: squared correlation of both.
+    """
+
+    count: int
+    gains: Float[np.ndarray, " lag"]
+    fit: Float[np.ndarray, " lag"]
+
+    @property
+    def best(self) -> int:
+        """Index of the delay at which both agree best."""
+        return int(self.fit.argmax())
+
+    def evidence(self, fit: Float[np.ndarray, "*lag"]) -> Float[np.ndarray, "*lag"]:
+        """Return the log-likelihood ratio of the best delay to one with another fit."""
+        # Half the count times the log of the ratio of residuals is a log-likelihood
+        # ratio. A quarter, because every other chord overlaps its neighbours.
+        ratio = (1.0 - fit + 1e-9) / (1.0 - self.fit[self.best] + 1e-9)
+        return np.asarray(0.25 * self.count * np.log(ratio))
+
+    def interval(self) -> tuple[float, float, float] | None:
+        """Return the delay [s] and the ends of its 95 % confidence interval [s].
+
+        The interval has all delays whose likelihood ratio to the best one is within
+        χ²_{0.95}(1) / 2. Between the delays that were tried, the best one is at the
+        vertex of a parabola, and the ends are interpolated linearly. None if motion and
+        rate have nothing in common beyond chance, or if a delay at the end of the range
+        may be right.
+        """
+        worse = self.evidence(self.fit)
+        middle = self.best
+        if self.evidence(np.zeros(())) < CERTAIN or middle in (0, LAGS - 1):
+            return None
+        before, here, after = worse[middle - 1 : middle + 2]
+        bend = max(0.5 * (before - 2.0 * here + after), 1e-12)
+        vertex = np.clip(0.25 * (before - after) / bend, -0.5, 0.5)
+        worse = worse - (here - bend * vertex**2)
+        likely = np.flatnonzero(worse < QUANTILE)
+        if not likely.size:
+            likely = np.array([middle])
+        first = int(likely[0])
+        last = int(likely[-1])
+        if first == 0 or last == LAGS - 1:
+            return None
+        step = 2.0 * LARGEST_LAG / (LAGS - 1)
+        outside = (first - 1, last + 1)
+        ends = []
+        for inner, outer in zip((first, last), outside, strict=True):
+            rise = max(worse[outer] - worse[inner], 1e-12)
+            share = (QUANTILE - worse[inner]) / rise
+            ends.append(inner + np.clip(share, 0.0, 1.0) * (outer - inner))
+        delay, low, high = (step * (at - ZERO_LAG) for at in (middle + vertex, *ends))
+        return float(delay), float(min(low, delay)), float(max(high, delay))
+
+
+def find_profile(
+    tables: Iterable[Float[np.ndarray, "_ column"]], *, held: bool = False
+) -> Profile | None:
+    """Correlate a motion with a rate over chords, at every delay.
+
+    The arguments are those of `find_delay`. None if there are too few chords or nothing
+    moves.
+    """
+    motion, expected = _over_chords(tables, held)
+    count = len(motion)
+    if count < FEWEST_CHORDS:
+        return None
+    motion = motion - motion.mean()
+    expected = expected - expected.mean(axis=1, keepdims=True)
+    power = np.sum(expected**2, axis=1)
+    if not (motion.any() and power.min() > 0.0):
+        return None
+    gains = expected @ motion / power
+    return Profile(count, gains, gains**2 * power / np.sum(motion**2))
+
+
 def find_delay(
     tables: Iterable[Float[np.ndarray, "_ column"]], *, held: bool = False
 ) -> Delay:
@@ -126,27 +213,16 @@ def find_delay(
     Returns:
         The delay, or an empty `Delay` if there are too few chords or nothing moves.
     """
-    motion, expected = _over_chords(tables, held)
-    count = len(motion)
-    if count < FEWEST_CHORDS:
+    profile = find_profile(tables, held=held)
+    if profile is None:
         return Delay()
-    motion = motion - motion.mean()
-    expected = expected - expected.mean(axis=1, keepdims=True)
-    power = np.sum(expected**2, axis=1)
-    if not (motion.any() and power.min() > 0.0):
-        return Delay()
-    gains = expected @ motion / power
-    fit = gains**2 * power / np.sum(motion**2)
-    best = int(fit.argmax())
-    # Half the count times the log of the ratio of residuals is a log-likelihood ratio.
-    # A quarter, because every other chord overlaps its neighbours.
-    ratio = (1.0 - fit[ZERO_LAG] + 1e-9) / (1.0 - fit[best] + 1e-9)
+    best = profile.best
     lags = np.linspace(-LARGEST_LAG, LARGEST_LAG, LAGS)
     return Delay(
         lag=float(lags[best]),
-        alike=float(np.sqrt(fit[best])),
-        gain=float(gains[best]),
-        certain=bool(0.25 * count * np.log(ratio) > 10.0),
+        alike=float(np.sqrt(profile.fit[best])),
+        gain=float(profile.gains[best]),
+        certain=bool(profile.evidence(profile.fit)[ZERO_LAG] > CERTAIN),
     )
 
 
