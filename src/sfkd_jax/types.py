@@ -263,6 +263,11 @@ class Model(NamedTuple):
     frame: Frame = BODY_FRAME
     planning: Model | None = None
 
+    @property
+    def predicting(self) -> Model:
+        """The model that predicts best: `planning` where there is one."""
+        return self.planning or self
+
 
 class Controller(NamedTuple):
     """A control law as two pure functions.

@@ -127,8 +127,11 @@ def _layers(
     inner = planner
     if inner is None:
         inner = _planner_along_path(settings, loop, adaptive=adaptive)
-    # Shield and prediction have the certified model, not that of the planner.
-    certified = with_offset(loop.model) if adaptive else loop.model
+    certified = loop.model
+    predicting = loop.model.predicting
+    if adaptive:
+        certified = with_offset(certified)
+        predicting = with_offset(predicting)
     # A shield needs a certified corridor; without one the planner drives alone.
     shielded = planner is not None or settings.shield
     if shielded and certificate is not None and certificate.corridor is not None:
@@ -136,7 +139,7 @@ def _layers(
             inner, certified, loop.plant, loop.law, certificate, latency=loop.latency
         )
     if loop.delay.first:
-        inner = _predicting(inner, certified, loop, certificate)
+        inner = _predicting(inner, predicting, loop, certificate)
     if adaptive:
         inner = _adapting(inner, settings, loop)
     return _along_reference(inner, settings, loop, certificate)
@@ -221,7 +224,7 @@ def _tracking_task(
         "plain": path_following.no_feedback(speed_loop=plant.speed_loop),
     }
     return path_following.path_tracking(
-        model.planning or model,
+        model.predicting,
         _cost(settings, plant),
         choose(laws, settings.sampling, "controller.sampling"),
         dt=plant.dt,
@@ -241,7 +244,7 @@ def _planner_along_path(
         adaptive: whether it predicts with the offset that an adaptation around it
             estimates, see `rollout.with_offset`.
     """
-    predicts = loop.model.planning or loop.model
+    predicts = loop.model.predicting
     if adaptive:
         predicts = with_offset(predicts)
     task = path_following.following_law(
@@ -270,7 +273,7 @@ def _adapting(inner: Controller, settings: SearchSettings, loop: _Loop) -> Contr
     adaptation = path_following.Adaptation(
         inner=inner,
         # Without the offset, which the filter itself adds.
-        model=loop.model.planning or loop.model,
+        model=loop.model.predicting,
         law=loop.law,
         estimate_env=loop.estimates_env,
         delay=loop.delay,
@@ -347,7 +350,7 @@ def _along_reference(
         )
     gate = path_following.Gate(
         inner=inner,
-        prediction=_prediction(loop.model, loop, certificate),
+        prediction=_prediction(loop.model.predicting, loop, certificate),
         horizon=controller_horizon(settings, loop.delay),
         reads_env=not loop.estimates_env,
         tests=tests,

@@ -12,7 +12,7 @@ from sfkd_jax.driving import path_following, plants
 from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
 from sfkd_jax.latency import NO_LATENCY, Latency
-from sfkd_jax.types import BODY, Controller, Model
+from sfkd_jax.types import Controller, Model
 
 ROAD_MARGIN = 0.05
 """Relative enlargement of the box of κ and v_ref, since the curvature of a reference is
@@ -100,9 +100,12 @@ def measurement_tests(
         estimates_env: whether e is estimated while driving. The innovations are then
             not those of the calibration, and are not tested.
     """
-    noise = (*corridor.conditions.sensor_noise, 0.0, 0.0, 0.0, 0.0)
+    names = plant.state_names
+    noise = (*corridor.conditions.sensor_noise, *(0.0 for _ in names))[: len(names)]
     odometry = path_following.OdometryTest(
-        position=max(noise[:2]), speed=noise[BODY.start], dt=plant.dt
+        deviations=noise,
+        dt=plant.dt,
+        sideways=names.index("v_y") if "v_y" in names else None,
     )
     if estimates_env:
         return path_following.MeasurementTests(odometry=odometry)

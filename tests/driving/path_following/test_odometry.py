@@ -9,20 +9,25 @@ from helpers import jit
 from sfkd_jax.driving.path_following import OdometryTest
 
 POSITION, YAW, SPEED, DT = 0.015, 0.002, 0.03, 0.1
-TEST = OdometryTest(position=POSITION, speed=SPEED, dt=DT)
+NOISE = (POSITION, POSITION, YAW, SPEED, 0.02)
+TEST = OdometryTest(deviations=NOISE, dt=DT, sideways=4)
 
 
 def circle(steps, speed=10.0, radius=20.0):
-    """Exact states of a vehicle on a circle, (step, 4)."""
+    """Exact states of a vehicle that slides on a circle, (step, 5): v_y = 0.3 m/s."""
     way = speed * DT * np.arange(steps)
     angle = way / radius
     chord = [radius * np.sin(angle), radius * (1.0 - np.cos(angle))]
-    return np.stack([*chord, angle, np.full(steps, speed)], axis=1)
+    slip = 0.3 / speed
+    still = np.ones(steps)
+    yaw = angle - np.arctan(slip)
+    speeds = speed * still * np.asarray([[np.cos(slip)], [np.sin(slip)]])
+    return np.stack([*chord, yaw, *speeds], axis=1)
 
 
 def alarms(states, used=None, noise=1.0, seed=0):
     """Whether there is an alarm at each step."""
-    spread = noise * np.asarray([POSITION, POSITION, YAW, SPEED])
+    spread = noise * np.asarray(NOISE)
     seen = states + spread * np.random.default_rng(seed).normal(size=states.shape)
     used = np.ones(len(states), bool) if used is None else used
 
@@ -32,7 +37,7 @@ def alarms(states, used=None, noise=1.0, seed=0):
 
     inputs = jnp.asarray(seen, float), jnp.asarray(used)
     scan = jit(lambda start, inputs: jax.lax.scan(step, start, inputs)[1])
-    return tuple(map(np.asarray, scan(TEST.init(4), inputs)))
+    return tuple(map(np.asarray, scan(TEST.init(), inputs)))
 
 
 def test_an_hour_of_right_sensors_raises_no_alarm():
@@ -56,6 +61,15 @@ def test_a_position_of_another_scale_is_found(scale, first, last):
     raised, _ = alarms(states)
     assert not raised[:60].any()
     assert first <= np.argmax(raised[59:]) <= last
+
+
+def test_a_position_that_is_dragged_aside_is_found():
+    """0.1 m/s, on a straight and at 10 m/s."""
+    states = circle(120, radius=1e6)
+    states[60:, 1] += 0.01 * np.arange(1, 61)
+    raised, _ = alarms(states)
+    assert not raised[:60].any()
+    assert 8 <= np.argmax(raised[59:]) <= 40
 
 
 def test_what_a_worn_tyre_does_is_tolerated():

@@ -79,11 +79,13 @@ def simulate_nominal(
 def innovations(loop: Loop, readings: Reading) -> Observed:
     """Return innovations and levels of runs, as a gate computes them while driving.
 
+    They are those of the model that planners roll out, which predicts best.
+
     Args:
         loop: that drove the runs.
         readings: of its law, (run, time, …).
     """
-    model = loop.model
+    model = loop.model.predicting
     law = loop.law
 
     def step(reading: Reading, after: Array) -> tuple[Array, Array]:

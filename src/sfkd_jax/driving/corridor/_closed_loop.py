@@ -123,7 +123,8 @@ def law_sensors(loop: Loop, *, noisy: bool = True) -> Sensors:
     later = CommandDelay(tuple(max(p - delay.first, 0.0) for p in delay.periods))
     # e is known at the call, and the command acts later.
     call = ceil(loop.latency.actuators(loop.plant.dt).first)
-    prediction = Prediction(model=loop.model, law=loop.law, dt=loop.plant.dt)
+    model = loop.model.predicting
+    prediction = Prediction(model=model, law=loop.law, dt=loop.plant.dt)
     low, high = map(jnp.asarray, loop.limits)
 
     def init(state: State, inputs: Control, env: Environment) -> Past:
@@ -154,7 +155,7 @@ def law_sensors(loop: Loop, *, noisy: bool = True) -> Sensors:
         known = past.env[0]
         expected = seen
         if delay.first:
-            fiber = loop.model.fiber(loop.params, known)
+            fiber = model.fiber(loop.params, known)
             periods = periods_ahead(delay, roads, past.sent)
             expected, _ = prediction.ahead(fiber, known, seen, periods)
         feedback = loop.law.turn(road[0], road[1], known).feedback(expected)

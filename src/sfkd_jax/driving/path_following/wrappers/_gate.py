@@ -182,7 +182,7 @@ class Gate(Stateful):
             doubt=jnp.zeros((), jnp.int32),
             env=0.5 * jnp.sum(jnp.asarray(box, dtype=float), axis=0),
             road=jnp.zeros((self.horizon, 2)),
-            tests=self.tests.init(states=size + 1),
+            tests=self.tests.init(),
             past=jnp.full((steps, size + 1), jnp.nan, dtype=float),
         )
 

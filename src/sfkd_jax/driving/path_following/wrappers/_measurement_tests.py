@@ -38,15 +38,11 @@ class MeasurementTests(NamedTuple):
     innovation: InnovationTest | None = None
     odometry: OdometryTest | None = None
 
-    def init(self, states: int) -> TestsState:
-        """Return the state before the first measurement.
-
-        Args:
-            states: size of an observation.
-        """
+    def init(self) -> TestsState:
+        """Return the state before the first measurement."""
         return TestsState(
             innovation=None if self.innovation is None else self.innovation.init(),
-            odometry=None if self.odometry is None else self.odometry.init(states),
+            odometry=None if self.odometry is None else self.odometry.init(),
         )
 
     def update(

@@ -1,4 +1,4 @@
-"""A test whether the measured positions move as the measured speed says."""
+"""A test whether the measured positions move as the measured speeds say."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.driving.path_following.wrappers._innovations import RELEASE, WINDOWS
-from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import POSE, Scalar, State
 
-TOLERANCE = 0.01
-"""Share of the way by which position and speed may differ: a worn tyre."""
+TOLERANCE = (0.01, 0.002)
+"""Share of the way by which position and speed may differ, along and across the
+vehicle: a worn tyre, and a sensor of the yaw that is mounted 2 mrad off.
+"""
 DEVIATIONS = 6.0
 """Threshold in standard deviations of the mean: about one false alarm in a year."""
+YAW = 2
+"""Index of the yaw in a state of a vehicle."""
 SPEED = 3
 """Index of the speed in a state of a vehicle."""
 
@@ -25,43 +29,41 @@ class OdometryState(NamedTuple):
 
     Attributes:
         before: last complete observation; NaN without one.
-        means: moving means of the difference and of the way of a step [m].
+        means: moving means of the differences along and across the vehicle, and of the
+            way of a step [m].
         alarm: whether the last step raised or kept one.
     """
 
     before: State
-    means: Float[Array, "window 2"]
+    means: Float[Array, "window 3"]
     alarm: Bool[Array, ""]
 
 
 class OdometryTest(NamedTuple):
-    """Moving means of the difference between a step of the position and that of speed.
+    """Moving means of the difference between a step of the position and of the speeds.
 
-        r = (p⁺ − p) · (cos ψ̄, sin ψ̄) − Δt (v + v⁺) / 2,   m_w ← m_w + w (r − m_w)
+        r = R(−ψ̄) (p⁺ − p) − Δt (v̄, v̄_y),   m_w ← m_w + w (r − m_w)
 
-    ψ̄ is the mean yaw of the step. The noise of a position telescopes in a mean, so a
-    position that stands still, is dragged along the road, or is scaled, contradicts the
-    speed after few steps. Neither a model nor a reference is needed.
+    Bars are means of both ends of the step. The noise of a position telescopes in a
+    mean, so a position that stands still, is dragged away, or is scaled, contradicts
+    the speeds after few steps. Neither a model nor a reference is needed. Across the
+    vehicle only one that measures v_y is tested.
 
     Attributes:
-        position: standard deviation of a measured position [m].
-        speed: of a measured speed [m/s].
+        deviations: standard deviations of the measured states.
         dt: sampling period [s].
+        sideways: index of v_y [m/s] in a state; None if it is not measured.
     """
 
-    position: float
-    speed: float
+    deviations: tuple[float, ...]
     dt: float
+    sideways: int | None = None
 
-    def init(self, states: int) -> OdometryState:
-        """Return the state before the first measurement.
-
-        Args:
-            states: size of an observation.
-        """
+    def init(self) -> OdometryState:
+        """Return the state before the first measurement."""
         return OdometryState(
-            before=jnp.full(states, jnp.nan, dtype=float),
-            means=jnp.zeros((len(WINDOWS), 2)),
+            before=jnp.full(len(self.deviations), jnp.nan, dtype=float),
+            means=jnp.zeros((len(WINDOWS), 3)),
             alarm=jnp.asarray(False),
         )
 
@@ -77,17 +79,21 @@ class OdometryTest(NamedTuple):
         """
         before = state.before
         step = observation - before
-        yaw = before[2] + 0.5 * wrap_angle(step[2])
-        forwards = step[0] * jnp.cos(yaw) + step[1] * jnp.sin(yaw)
-        way = 0.5 * self.dt * (observation[SPEED] + before[SPEED])
-        now = jnp.stack([forwards - way, jnp.abs(way)])
+        yaw = before[YAW] + 0.5 * wrap_angle(step[YAW])
+        forwards, left = rotate(-yaw, step[:2])
+        ways = 0.5 * self.dt * (observation + before)
+        across = jnp.zeros(())
+        if self.sideways is not None:
+            across = left - ways[self.sideways]
+        now = jnp.stack([forwards - ways[SPEED], across, jnp.abs(ways[SPEED])])
         moved = state.means + jnp.asarray(WINDOWS)[:, None] * (now - state.means)
         # In the frame of the vehicle its pose is 0, and no position is measured.
         in_the_world = jnp.any(observation[POSE] != 0.0)
         compared = used & in_the_world & jnp.all(jnp.isfinite(now))
         means = jnp.where(compared, moved, state.means)
-        allowed = DEVIATIONS * self._deviations() + TOLERANCE * means[:, 1]
-        statistic = jnp.max(jnp.abs(means[:, 0]) / allowed)
+        way = means[:, 2:]
+        allowed = DEVIATIONS * self._spread(way) + way * jnp.asarray(TOLERANCE)
+        statistic = jnp.max(jnp.abs(means[:, :2]) / allowed)
         after = OdometryState(
             before=jnp.where(used, observation, jnp.nan),
             means=means,
@@ -95,11 +101,18 @@ class OdometryTest(NamedTuple):
         )
         return after, statistic
 
-    def _deviations(self) -> Float[Array, " window"]:
-        """Return the standard deviations of the means [m]."""
-        w = np.asarray(WINDOWS)
+    def _spread(self, way: Float[Array, "window 1"]) -> Float[Array, "window 2"]:
+        """Return the standard deviations of the means, along and across [m].
+
+        Args:
+            way: of a step [m].
+        """
+        noise = np.asarray(self.deviations)
+        w = np.asarray(WINDOWS)[:, None]
         share = w / (2.0 - w)
         # White noise of the position enters a step twice, with both signs.
-        position = self.position**2 * 2.0 * w * share
-        speed = (self.dt * self.speed) ** 2 * share
-        return jnp.asarray(np.sqrt(position + speed), dtype=float)
+        position = max(noise[:2]) ** 2 * 2.0 * w * share
+        across = 0.0 if self.sideways is None else noise[self.sideways]
+        speeds = (self.dt * np.stack([noise[SPEED], across])) ** 2 * share
+        turned = jnp.concatenate([jnp.zeros_like(way), noise[YAW] * way], axis=1)
+        return jnp.sqrt(position + speeds + share * turned**2)

@@ -158,8 +158,7 @@ class Plausibility:
 
         # An observation that is ahead of where the vehicle has driven, or behind, is of
         # another time or place, in all of its entries.
-        points = preview.reference
-        _, along = place_on(state.place, points, curvature_ahead(points))
+        along = self._expected_along(state, preview)
         gap = preview.along - along
         slack = self._slack(state, periods, preview.on_time)
         shifted = (jnp.abs(gap) > slack) & moving
@@ -170,16 +169,14 @@ class Plausibility:
         longest = round(PATIENCE_AHEAD / self.dt)
         usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
 
-        # What stays implausible for so long is true: the prediction was wrong.
         longest = jnp.where(late, longest, round(self.patience / self.dt))
-        overdue = state.missing >= longest
-        # A yaw alone is never believed for that reason: the position would show it.
-        overdue = put(overdue, HEADING, overdue[HEADING] & ~plausible[LATERAL])
+        overdue = _overdue(state.missing >= longest, plausible)
         measured = usable & (plausible | overdue | ~compared)
         # Either this measurement or all that was believed before is wrong, and nothing
         # says which.
         forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
         missing = jnp.where(measured, 0, state.missing + 1)
+
         xi = jnp.where(measured, observed, expected)
         xi = jnp.where(late, expected + earlier.difference_now, xi)
 
@@ -187,17 +184,14 @@ class Plausibility:
         skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
         heading = jnp.where(skewed, observed[HEADING] - skew, xi[HEADING])
         xi = put(xi, HEADING, heading)
-
         # A believed outlier starts anew; noise is averaged.
         estimate = expected + self.gain * difference(xi, expected)
         estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
         here = jnp.append(estimate, preview.road[0, 0])
         past = jnp.where(late, earlier.past, state.past)
-        seen_along = jnp.all(measured)
         # What is believed although it is far off starts anew.
         gain = jnp.where(shifted, 1.0, ALONG_GAIN)
-        along = along + gain * jnp.where(seen_along, gap, 0.0)
-        along = jnp.where(jnp.isfinite(along), along, preview.along)
+        along = along + jnp.where(jnp.all(measured), gain * gap, 0.0)
         after = state._replace(
             missing=missing,
             skew=jnp.where(skewed, skew, 0.0),
@@ -206,6 +200,12 @@ class Plausibility:
         )
         lost = jnp.any((missing > longest) & ~usable)
         return Believed(xi, measured, along, lost, after)
+
+    def _expected_along(self, state: GateState, preview: Preview) -> Scalar:
+        """Return the expected place on the path [m]; as observed where none is."""
+        points = preview.reference
+        _, along = place_on(state.place, points, curvature_ahead(points))
+        return jnp.where(jnp.isfinite(along), along, preview.along)
 
     def _skew(self, before: Scalar, innovation: Scalar, limit: Scalar) -> Scalar:
         """Return by which angle a wrong yaw is wrong [rad].
@@ -286,6 +286,18 @@ class Plausibility:
         low, high = map(jnp.asarray, self.box)
         tight = jnp.minimum(0.5 * self.share * (high - low), wide)
         return jnp.where(state.modelled & on_time, tight, wide)
+
+
+def _overdue(
+    long_missing: Bool[Array, " coordinate"], plausible: Bool[Array, " coordinate"]
+) -> Bool[Array, " coordinate"]:
+    """Return what is believed because it has been implausible for so long.
+
+    It is then true, and the prediction was wrong. A yaw alone is never believed for
+    that reason: the position would show it.
+    """
+    heading = long_missing[HEADING] & ~plausible[LATERAL]
+    return put(long_missing, HEADING, heading)
 
 
 def difference(xi: PathState, other: PathState) -> PathState:
