@@ -162,7 +162,8 @@ def test_rows_are_of_the_time_at_which_a_command_acts(policy, driven, folder, sc
     order = np.argsort(true.states[:, 9, 5])
     true = jax.tree.map(lambda leaf: leaf[order], true)
     np.testing.assert_allclose(runs.states, true.states, atol=1e-4)
-    np.testing.assert_allclose(runs.controls[..., 2:], true.controls[..., 2:])
+    road = runs.controls[..., 2:]
+    np.testing.assert_allclose(road, true.controls[..., 2:], atol=1e-5)
     np.testing.assert_array_equal(runs.controls[..., :2], nu[order])
     measured = scores(runs)
     # The law reads a prediction, whose error is part of what acts. In a corridor it is

@@ -24,13 +24,15 @@ from sfkd_jax.driving.path_following import (
     expected_coordinates,
     turning_rate,
 )
-from sfkd_jax.rollout import rollout
+from sfkd_jax.rollout import in_batches, rollout
 from sfkd_jax.types import BODY, Environment, Key, State, Trajectory
 
 BATCHES = 10
 """Number of times that all runs are simulated for the calibration. Half of these
 simulations fix the units of the charts.
 """
+RUNS_AT_ONCE = 50
+"""Runs whose innovations are computed at once."""
 SHARES = (0.5, 0.75, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999)
 """Shares of the steps, in the order of their levels. The steps between two shares are a
 group, and every group has a standard deviation of its own.
@@ -101,8 +103,14 @@ def innovations(loop: Loop, readings: Reading) -> Observed:
         innovation = jnp.append(after - expected, (after - before)[HEADING] - turned)
         return innovation, turn.level
 
+    def of_run(run: tuple[Reading, Array]) -> tuple[Array, Array]:
+        return jax.vmap(step)(*run)
+
     first = jax.tree.map(lambda leaf: leaf[:, :-1], readings)
-    return jax.vmap(jax.vmap(step))(first, readings.measured[:, 1:])
+    # A model of planners needs much memory for each of so many steps.
+    return in_batches(
+        jax.vmap(of_run), (first, readings.measured[:, 1:]), size=RUNS_AT_ONCE
+    )
 
 
 @jax.jit

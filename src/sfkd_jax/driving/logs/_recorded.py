@@ -290,7 +290,7 @@ def _law_control(delay: CommandDelay, trained: Any) -> Callable[..., Control]:
     box = trained.settings["environment"]
     low = jnp.asarray(box["low"])
     high = jnp.asarray(box["high"])
-    model = trained.model
+    model = trained.model.predicting
     params = fold(model, trained.params, on_host)
     prediction = Prediction(model=model, law=trained.law, dt=trained.vehicle.dt)
 

@@ -45,6 +45,7 @@ from sfkd_jax.driving.path_following.tasks._preview import (
     Preview,
     check_preview,
     later,
+    road_from,
 )
 from sfkd_jax.geometry import entrywise, without_pose
 from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
@@ -160,9 +161,10 @@ class AlongReference(Stateful):
         info = info._replace(plan=info.plan._replace(states=states))
         measured = preview.measured if info.gate is None else info.gate.measured
         seen = jnp.where(measured, xi, jnp.nan)
+        inputs = road_from(preview, along)[0]
         info = info._replace(
             claim=info.claim.under(preview.reason),
-            path=PathInfo(xi=seen, inputs=road[0], planned=planned),
+            path=PathInfo(xi=seen, inputs=inputs, planned=planned),
         )
         sent = pushed(state.sent, control)
         return control, AlongReferenceState(inner, observations, sent), info
