@@ -522,6 +522,24 @@ def foreign_cars():
     return table(["error over that of MPPI with the bicycle", *heads], lines)
 
 
+# ---- latency
+
+
+def margins():
+    """The margins of the laws that ship, at some speeds."""
+    found = []
+    for car in CARS:
+        folder = PRETRAINED / policy_of(car)
+        claimed = certificate.read(folder / "certificate.json", DrivingCertificate)
+        found.append(claimed.corridor.margins)
+    lines = []
+    for index in range(0, len(found[0].speed), 3):
+        line = [f"{found[0].speed[index]:g}"]
+        line += [f"{margin.delay_s[index]:.2f}" for margin in found]
+        lines.append(line)
+    return table(["speed [m/s]", *(f"{car}: delay [s]" for car in CARS)], lines)
+
+
 # ---- lanes
 
 DRIVERS = {
@@ -581,6 +599,7 @@ BLOCKS = {
     "docs/lane.md": {"lane": lane, "lane_time": lane_time},
     "docs/planner.md": {"timing": timing, "planners": planners},
     "docs/adaptation.md": {"adaptation": adaptation},
+    "docs/real-car.md": {"margins": margins},
     "docs/results.md": results.TABLES | {"peers": peers, "commonroad": foreign_cars},
 }
 """Page -> name of a block -> what fills it."""

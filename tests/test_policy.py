@@ -172,7 +172,11 @@ def test_what_planners_add_to_the_model_reaches_no_shield():
     for size in (0.0, 1.0, 1e30, np.nan):
         more = jax.tree.map(lambda leaf, size=size: leaf + size, weights["planning"])
         params = trained.params._replace(weights={**weights, "planning": more})
-        told.append(shielded_act(params, shielded.init(KEY), x, ENV, straight(20)))
+        control, _, info = shielded_act(
+            params, shielded.init(KEY), x, ENV, straight(20)
+        )
+        # What the gate expects of the next step is the planners' prediction.
+        told.append((control, info))
         u, _, info = act(params, memory, x, ENV, straight(20))
         assert bool(info.claim.holds)
         assert float(info.shield.margin) > 0.0
