@@ -60,6 +60,16 @@ def by_car(text, found):
 # ---- the corridor
 
 
+def shipped():
+    """(corridor, proved rate, whether it is of other weights) of every car's policy."""
+    for car in CARS:
+        folder = PRETRAINED / policy_of(car)
+        claimed = certificate.read(folder / "certificate.json", DrivingCertificate)
+        _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
+        old = claimed.provenance.policy_sha256 != manifest["content_sha256"]
+        yield claimed.corridor, claimed.proof.outputs["position"].alpha, old
+
+
 def claims():
     """What is claimed of every car's corridor: a list of (numbers by name, whether old).
 
@@ -67,21 +77,16 @@ def claims():
     the car of highway-env.
     """
     found = []
-    for car in CARS:
-        folder = PRETRAINED / policy_of(car)
-        claimed = certificate.read(folder / "certificate.json", DrivingCertificate)
-        _, manifest = store.read_arrays(folder / "policy.safetensors", kind="policy")
-        about = claimed.corridor
+    for about, alpha, old in shipped():
         numbers = {
             "corridor_m": about.corridor_m,
             "coverage": about.coverage.share,
             "coverage_ci95": about.coverage.ci95,
             "coverage_s3": about.by_scenario["s3"].share,
-            "alpha": claimed.proof.outputs["position"].alpha,
+            "alpha": alpha,
         }
         for group, counted in about.by_group.items():
             numbers[f"coverage_{group}"] = counted.coverage.share
-        old = claimed.provenance.policy_sha256 != manifest["content_sha256"]
         found.append((numbers, old))
     foreign = read("experiments/simulator.json")
     found.append((foreign, is_old(foreign)))
@@ -525,17 +530,63 @@ def foreign_cars():
 # ---- latency
 
 
+def latency():
+    """Errors on S3 with latency, over those without."""
+    rows = read("benchmarks/latency.json")["rows"]
+    found = {(row["car"], row["case"]): row for row in rows}
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        line = [case]
+        for car in CARS:
+            row = found[car, case]
+            on_time = found[car, "on time"]
+            ratio = row["rmse_mm"] / on_time["rmse_mm"]
+            for text in (
+                f"{row['rmse_mm']:.1f}",
+                f"{ratio:.2f}",
+                f"{row['departures']}",
+            ):
+                line.append(measured(text, row, policy=policy_of(car)))
+        lines.append(line)
+    heads = ["latency of the car"]
+    for car in CARS:
+        heads += [f"{car}: RMSE [mm]", "over that on time", "runs that leave the road"]
+    return table(heads, lines)
+
+
+SENSED = {
+    "departures": "runs that leave the road",
+    "largest_m": "largest distance [m]",
+    "beyond_claim": "steps beyond a claim",
+    "claimed": "share of steps with a claim",
+}
+"""Number of a row of sensors.json -> its name."""
+
+
+def sensors():
+    """What wrong sensors and other references do, on S3."""
+    rows = read("benchmarks/sensors.json")["rows"]
+    found = {(row["car"], row["case"]): row for row in rows}
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        line = [case]
+        for car in CARS:
+            row = found[car, case]
+            for number in SENSED:
+                line.append(measured(f"{row[number]:g}", row, policy=policy_of(car)))
+        lines.append(line)
+    heads = [f"{car}: {name}" for car in CARS for name in SENSED.values()]
+    return table(["what is wrong", *heads], lines)
+
+
 def margins():
     """The margins of the laws that ship, at some speeds."""
-    found = []
-    for car in CARS:
-        folder = PRETRAINED / policy_of(car)
-        claimed = certificate.read(folder / "certificate.json", DrivingCertificate)
-        found.append(claimed.corridor.margins)
+    found = [(corridor.margins, old) for corridor, _, old in shipped()]
+    speeds = found[0][0].speed
     lines = []
-    for index in range(0, len(found[0].speed), 3):
-        line = [f"{found[0].speed[index]:g}"]
-        line += [f"{margin.delay_s[index]:.2f}" for margin in found]
+    for index in range(0, len(speeds), 3):
+        line = [f"{speeds[index]:g}"]
+        line += [Measured(f"{of.delay_s[index]:.2f}", old) for of, old in found]
         lines.append(line)
     return table(["speed [m/s]", *(f"{car}: delay [s]" for car in CARS)], lines)
 
@@ -599,7 +650,11 @@ BLOCKS = {
     "docs/lane.md": {"lane": lane, "lane_time": lane_time},
     "docs/planner.md": {"timing": timing, "planners": planners},
     "docs/adaptation.md": {"adaptation": adaptation},
-    "docs/real-car.md": {"margins": margins},
+    "docs/real-car.md": {
+        "margins": margins,
+        "latency": latency,
+        "sensors": sensors,
+    },
     "docs/results.md": results.TABLES | {"peers": peers, "commonroad": foreign_cars},
 }
 """Page -> name of a block -> what fills it."""

@@ -54,7 +54,8 @@ class ControllerNode(Node):
         self.dt = self.policy.settings["vehicle"]["dt"]
         self.horizon = self.policy.settings["controller"]["mppi"]["horizon"]
         self.act = sfkd_jax.warm_up(self.policy)
-        self.memory = self.policy.controller.init(jax.random.key(self.setting("seed")))
+        key = jax.random.key(self.setting("seed"))
+        self.start = self.memory = self.policy.controller.init(key)
 
         self.odometry = None
         self.env = None
@@ -149,6 +150,9 @@ class ControllerNode(Node):
             dt=self.dt,
             horizon=self.horizon,
         )
+        if fresh and self.blind > self.setting("patience"):
+            # It has not seen the braking, and begins anew.
+            self.memory = self.start
         control, self.memory, info = self.act(
             self.policy.params, self.memory, observation, self.env, reference
         )

@@ -354,15 +354,15 @@ def test_a_switch_of_the_environment_moves_nominal_model_and_car_alike():
 
 
 def test_a_car_outside_its_bound_is_reported_and_followed():
-    """Displaced by 0.5 m: the bound is exceeded once, then the nominal model is there."""
+    """Displaced by 0.4 m: the bound is exceeded once, then the nominal model is there."""
     kick = np.zeros((20, 3))
-    kick[9, 0] = 0.5
+    kick[9, 0] = 0.4
     controller = filtered(width=1.0, noise_allowance=0.01)
     xi, _, info = jit(partial(drive, controller))(jnp.zeros((20, 2)), kick)
     np.testing.assert_array_equal(
         np.flatnonzero(info.claim.reason == Reason.BOUND_EXCEEDED), [10]
     )
-    np.testing.assert_allclose(info.shield.nominal_distance[10], 0.5, atol=1e-4)
+    np.testing.assert_allclose(info.shield.nominal_distance[10], 0.4, atol=1e-4)
     np.testing.assert_allclose(info.shield.nominal_state[10:], xi[10:], atol=1e-4)
     assert not info.claim.holds[10]
 

@@ -12,7 +12,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL, PATH_SPEED, PathState
 from sfkd_jax.geometry import entrywise, wrap_angle
@@ -75,6 +75,10 @@ class SteadyTurn(NamedTuple):
         errors = entrywise(jnp.subtract, xi, self.state)
         linear = entrywise(jnp.subtract, self.control, self.gain @ errors)
         return recovering(self, errors, linear)
+
+    def is_linear(self, xi: PathState) -> Bool[Array, ""]:
+        """Whether the law is the linear one here, around which models are learned."""
+        return course(self, xi - self.state).far <= 0.0
 
     @property
     def level(self) -> Scalar:

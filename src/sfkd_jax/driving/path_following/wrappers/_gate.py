@@ -344,7 +344,7 @@ class Gate(Stateful):
             ahead = jnp.append(after.xi[1], xi[HEADING] + predict.dt * rate)
             clear = inputs.reason == Reason.CERTIFIED
             clear = clear & jnp.all(believed.measured)
-            comparable = clear & after.inside[1] & after.usual[1]
+            comparable = clear & after.inside[1]
             test = test._replace(
                 expected=jnp.where(comparable, ahead, jnp.nan), level=turn.level
             )

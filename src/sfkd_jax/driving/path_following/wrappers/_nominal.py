@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool
 
 from sfkd_jax.control import all_finite
 from sfkd_jax.driving.path_coordinates import LATERAL, PathState
+from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
 from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._conditions import Conditions
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
     BODY,
-    Control,
     Environment,
     Fiber,
     Key,
@@ -60,7 +60,8 @@ class Comparison(NamedTuple):
         nominal_state: ξ of the nominal model, (coordinate,); NaN before its start.
         distance: |e_y − ê_y| [m]; NaN without a comparison.
         bound_exceeded: whether the distance exceeds what is allowed.
-        outside_box: whether ξ, road or e is outside the conditions.
+        outside_box: whether ξ, road or e is outside the conditions, or the law is not
+            linear, as where the speed is far from that of the reference.
         env_inside: whether e is inside its box.
     """
 
@@ -111,7 +112,7 @@ class NominalModel(NamedTuple):
         xi: PathState,
         env: Environment,
         preview: Preview,
-        law_control: Control,
+        turn: SteadyTurn,
     ) -> Comparison:
         """Compare the nominal model with a measurement, and start it if need be.
 
@@ -121,8 +122,8 @@ class NominalModel(NamedTuple):
             xi: measured ξ.
             env: measured e.
             preview: of the road, with what the gate says about the measurement.
-            law_control: of the law at ξ; the model does not start where it is not
-                finite.
+            turn: of the law on this road. The model does not start where its control
+                is not finite, and says nothing where it is not linear.
         """
         model = self.model
         inside = self.conditions.nearest(env)
@@ -138,7 +139,7 @@ class NominalModel(NamedTuple):
 
         latent = jax.lax.cond(jnp.all(inside == before.env), unchanged, transported)
         anchor = model.encode(fiber, without_pose(xi))
-        readable = all_finite((anchor, law_control))
+        readable = all_finite((anchor, turn.feedback(xi)))
         compared = before.started & preview.measured[LATERAL]
         distance = jnp.abs(xi - model.decode(fiber, latent)[BODY])[LATERAL]
         allowed = self.tube + self.noise_allowance + before.offset
@@ -151,6 +152,7 @@ class NominalModel(NamedTuple):
         started = readable & all_finite(latent)
         env_inside = jnp.all(inside == env)
         covered = self.conditions.hold(xi, preview.road[0]) & env_inside
+        covered &= turn.is_linear(xi)
         nominal = model.decode(fiber, latent)[BODY]
         return Comparison(
             state=before._replace(

@@ -17,7 +17,7 @@ TOLERANCE = (0.01, 0.002)
 vehicle: a worn tyre, and a sensor of the yaw that is mounted 2 mrad off.
 """
 DEVIATIONS = 6.0
-"""Threshold in standard deviations of the mean: about one false alarm in a year."""
+"""Threshold in standard deviations of the mean: a false alarm in some months."""
 YAW = 2
 """Index of the yaw in a state of a vehicle."""
 SPEED = 3

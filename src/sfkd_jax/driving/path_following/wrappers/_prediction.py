@@ -56,14 +56,13 @@ class Onward(NamedTuple):
 
     Attributes:
         xi: ξ one step later.
-        inside: whether the model says so, inside the conditions.
-        usual: whether the control differs from the law by no more than data and
-            planners add to it. Beyond that no model was learned.
+        inside: whether the model says so: inside the conditions, and with a control
+            that differs from the linear law by no more than data and planners add to
+            it. Beyond that no model was learned.
     """
 
     xi: PathState
     inside: Bool[Array, ""]
-    usual: Bool[Array, ""]
 
 
 class Periods(NamedTuple):
@@ -160,22 +159,25 @@ class Prediction:
             unseen: whether ξ is itself predicted.
         """
         nu = control - turn.feedback(xi)
-        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
         coasting = self._turning(turn, xi, control, road)
         if fiber is None:
-            return Onward(coasting, jnp.asarray(False), usual)
+            return Onward(coasting, jnp.asarray(False))
         after = expected_coordinates(self.model, fiber, xi, nu, road)
         finite = all_finite(after)
-        inside = self.conditions.hold(xi, road) & finite
-        believed = inside
+        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+        linear = turn.is_linear(xi)
+        covered = self.conditions.hold(xi, road)
+        inside = covered & linear & usual & finite
         if self.conditions.state is not None:
             # A vehicle that is not seen drives on its model somewhat outside as well:
             # a steady turn would be worse.
             low, high = map(np.asarray, self.conditions.state)
             more = OUTSIDE * (high - low)
-            near = jnp.all((low - more <= xi) & (xi <= high + more)) & finite
-            believed = inside | (unseen & near)
-        return Onward(jnp.where(believed, after, coasting), inside, usual)
+            near = jnp.all((low - more <= xi) & (xi <= high + more))
+            covered |= unseen & near
+        # The model continues the linear law for larger ν.
+        believed = covered & linear & finite
+        return Onward(jnp.where(believed, after, coasting), inside)
 
     def way(self, xi: PathState, road: Float[Array, " 2"]) -> Scalar:
         """Return the way along the path in one step [m], Δt v cos e_ψ / (1 − κ e_y)."""

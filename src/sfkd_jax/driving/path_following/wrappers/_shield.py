@@ -173,7 +173,7 @@ class Shield(Stateful):
         turn = self.law.turn(road[0, 0], road[0, 1], self.conditions.nearest(env))
         law_control = turn.feedback(xi)
         compared = self._nominal.compare(
-            params, state._replace(inner=inner), xi, env, preview, law_control
+            params, state._replace(inner=inner), xi, env, preview, turn
         )
         info = reported(info)
         decision = self._decide(
