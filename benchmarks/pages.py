@@ -558,7 +558,6 @@ SENSED = {
     "departures": "runs that leave the road",
     "largest_m": "largest distance [m]",
     "beyond_claim": "steps beyond a claim",
-    "claimed": "share of steps with a claim",
 }
 """Number of a row of sensors.json -> its name."""
 

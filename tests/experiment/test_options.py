@@ -32,7 +32,8 @@ TOGETHER = {
     "first": "dataset=path training=path comparison=table1 scenario=s1 evaluation=standard",
     "second": "dataset=tiny training=standard comparison=none scenario=s2 export=standard",
     "third": "training=state_model environment=none scenario=s3 evaluation=benchmark",
-    "estimated": "environment=estimated comparison=benchmark scenario=obstacles",
+    "estimated": "environment=estimated comparison=benchmark scenario=obstacles "
+    "dataset=path_with_margin",
     "measured": "environment=measured comparison=benchmark_path dataset=standard",
     "logs": "dataset=files dataset.path=logs environment=logged certification=standard",
 }

@@ -244,9 +244,7 @@ def flat_programs(
         params = jax.lax.optimization_barrier(trained.params)
         before = jax.tree.unflatten(structure, state_leaves)
         control, after, info = act(params, before, *measurements)
-        # What no layer has reported is a number, and becomes an array.
-        told = map(jnp.asarray, jax.tree.leaves(info))
-        return control, *_unpack(after), *told
+        return control, *_unpack(after), *map(jnp.asarray, jax.tree.leaves(info))
 
     control, after, info = jax.eval_shape(act, trained.params, state, *measured)
     states = _named("state", state)
