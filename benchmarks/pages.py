@@ -530,52 +530,54 @@ def foreign_cars():
 # ---- latency
 
 
-def latency():
-    """Errors on S3 with latency, over those without."""
-    rows = read("benchmarks/latency.json")["rows"]
+def by_case(name, texts):
+    """A table of a benchmark with rows of cars and cases, a line a case.
+
+    Args:
+        name: of the benchmark, whose first case has nothing wrong.
+        texts: heading -> (row, row of the first case of this car) -> its number.
+    """
+    rows = read(f"benchmarks/{name}.json")["rows"]
     found = {(row["car"], row["case"]): row for row in rows}
+    first, *_ = cases = list(dict.fromkeys(row["case"] for row in rows))
     lines = []
-    for case in dict.fromkeys(row["case"] for row in rows):
+    for case in cases:
         line = [case]
         for car in CARS:
             row = found[car, case]
-            on_time = found[car, "on time"]
-            ratio = row["rmse_mm"] / on_time["rmse_mm"]
-            for text in (
-                f"{row['rmse_mm']:.1f}",
-                f"{ratio:.2f}",
-                f"{row['departures']}",
-            ):
-                line.append(measured(text, row, policy=policy_of(car)))
+            line += [
+                measured(text(row, found[car, first]), row, policy=policy_of(car))
+                for text in texts.values()
+            ]
         lines.append(line)
-    heads = ["latency of the car"]
-    for car in CARS:
-        heads += [f"{car}: RMSE [mm]", "over that on time", "runs that leave the road"]
-    return table(heads, lines)
+    heads = [f"{car}: {heading}" for car in CARS for heading in texts]
+    return table(["what is late or wrong", *heads], lines)
 
 
-SENSED = {
-    "departures": "runs that leave the road",
-    "largest_m": "largest distance [m]",
-    "beyond_claim": "steps beyond a claim",
-}
-"""Number of a row of sensors.json -> its name."""
+def latency():
+    """Errors on S3 with latency, over those without."""
+    return by_case(
+        "latency",
+        {
+            "RMSE [mm]": lambda row, _: f"{row['rmse_mm']:.1f}",
+            "over that on time": lambda row, on_time: (
+                f"{row['rmse_mm'] / on_time['rmse_mm']:.2f}"
+            ),
+            "runs that leave the road": lambda row, _: f"{row['departures']}",
+        },
+    )
 
 
 def sensors():
     """What wrong sensors and other references do, on S3."""
-    rows = read("benchmarks/sensors.json")["rows"]
-    found = {(row["car"], row["case"]): row for row in rows}
-    lines = []
-    for case in dict.fromkeys(row["case"] for row in rows):
-        line = [case]
-        for car in CARS:
-            row = found[car, case]
-            for number in SENSED:
-                line.append(measured(f"{row[number]:g}", row, policy=policy_of(car)))
-        lines.append(line)
-    heads = [f"{car}: {name}" for car in CARS for name in SENSED.values()]
-    return table(["what is wrong", *heads], lines)
+    return by_case(
+        "sensors",
+        {
+            "runs that leave the road": lambda row, _: f"{row['departures']}",
+            "largest distance [m]": lambda row, _: f"{row['largest_m']:.3f}",
+            "steps beyond a claim": lambda row, _: f"{row['beyond_claim']}",
+        },
+    )
 
 
 def margins():

@@ -111,8 +111,8 @@ class Gate(Stateful):
 
     A coordinate is replaced by ξ⁻ if it does not pass, is not finite, or belongs to an
     observation that repeats the last one bit for bit while the vehicle moves. The
-    vehicle then drives on its nominal model, with the other coordinates measured. Of
-    the yaw of a wrong pose the changes are still used.
+    vehicle then drives on the prediction, with the other coordinates measured. Of the
+    yaw of a wrong pose the changes are still used.
 
     The place along the path is predicted from the speed, in the world, so a position
     that stands still or jumps along the path does not pass either, while a reference
@@ -142,7 +142,7 @@ class Gate(Stateful):
         reads_env: whether `inner` reads the environment that it is given.
         tests: that raise alarms.
         delay: of the commands after an observation.
-        patience: longest time on the nominal model [s].
+        patience: longest time on the prediction [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
         gain: L of the estimate from which the next step is predicted.
@@ -334,7 +334,7 @@ class Gate(Stateful):
         estimate = believed.state.past[0, :-1]
         xi = believed.xi
         unseen = ~believed.measured[LATERAL]
-        after = jax.vmap(partial(predict.onward, fiber, turn, here))(
+        after = jax.vmap(partial(predict.step, fiber, turn, here))(
             jnp.stack([estimate, xi]),
             jnp.stack([control, acting]),
             jnp.stack([unseen, jnp.asarray(False)]),
@@ -348,8 +348,8 @@ class Gate(Stateful):
             test = test._replace(
                 expected=jnp.where(comparable, ahead, jnp.nan), level=turn.level
             )
-        onward = shown._replace(along=believed.along + predict.way(estimate, here))
-        place = state_beside(after.xi[0], onward)[:2]
+        along = believed.along + predict.progress(estimate, here)
+        place = state_beside(after.xi[0], shown._replace(along=along))[:2]
         # In its own frame a vehicle does not move.
         moves = jnp.any(shown.observation[POSE] != 0.0)
         place = jnp.where(moves, place, jnp.nan)

@@ -13,7 +13,7 @@ from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.types import POSE, Scalar, State
 
 TOLERANCE = (0.01, 0.002)
-"""Share of the way by which position and speed may differ, along and across the
+"""Share of the distance by which position and speed may differ, along and across the
 vehicle: a worn tyre, and a sensor of the yaw that is mounted 2 mrad off.
 """
 DEVIATIONS = 6.0
@@ -30,7 +30,7 @@ class OdometryState(NamedTuple):
     Attributes:
         before: last complete observation; NaN without one.
         means: moving means of the differences along and across the vehicle, and of the
-            way of a step [m].
+            distance driven in a step [m].
         alarm: whether the last step raised or kept one.
     """
 
@@ -81,18 +81,20 @@ class OdometryTest(NamedTuple):
         step = observation - before
         yaw = before[YAW] + 0.5 * wrap_angle(step[YAW])
         forwards, left = rotate(-yaw, step[:2])
-        ways = 0.5 * self.dt * (observation + before)
+        integrals = 0.5 * self.dt * (observation + before)
         across = jnp.zeros(())
         if self.sideways is not None:
-            across = left - ways[self.sideways]
-        now = jnp.stack([forwards - ways[SPEED], across, jnp.abs(ways[SPEED])])
+            across = left - integrals[self.sideways]
+        driven = integrals[SPEED]
+        now = jnp.stack([forwards - driven, across, jnp.abs(driven)])
         moved = state.means + jnp.asarray(WINDOWS)[:, None] * (now - state.means)
         # In the frame of the vehicle its pose is 0, and no position is measured.
         in_the_world = jnp.any(observation[POSE] != 0.0)
         compared = used & in_the_world & jnp.all(jnp.isfinite(now))
         means = jnp.where(compared, moved, state.means)
-        way = means[:, 2:]
-        allowed = DEVIATIONS * self._spread(way) + way * jnp.asarray(TOLERANCE)
+        distance = means[:, 2:]
+        tolerated = distance * jnp.asarray(TOLERANCE)
+        allowed = DEVIATIONS * self._spread(distance) + tolerated
         statistic = jnp.max(jnp.abs(means[:, :2]) / allowed)
         after = OdometryState(
             before=jnp.where(used, observation, jnp.nan),
@@ -101,11 +103,11 @@ class OdometryTest(NamedTuple):
         )
         return after, statistic
 
-    def _spread(self, way: Float[Array, "window 1"]) -> Float[Array, "window 2"]:
+    def _spread(self, distance: Float[Array, "window 1"]) -> Float[Array, "window 2"]:
         """Return the standard deviations of the means, along and across [m].
 
         Args:
-            way: of a step [m].
+            distance: driven in a step [m].
         """
         noise = np.asarray(self.deviations)
         w = np.asarray(WINDOWS)[:, None]
@@ -114,5 +116,6 @@ class OdometryTest(NamedTuple):
         position = max(noise[:2]) ** 2 * 2.0 * w * share
         across = 0.0 if self.sideways is None else noise[self.sideways]
         speeds = (self.dt * np.stack([noise[SPEED], across])) ** 2 * share
-        turned = jnp.concatenate([jnp.zeros_like(way), noise[YAW] * way], axis=1)
-        return jnp.sqrt(position + speeds + share * turned**2)
+        turned = noise[YAW] * distance
+        yaw = jnp.concatenate([jnp.zeros_like(turned), turned], axis=1)
+        return jnp.sqrt(position + speeds + share * yaw**2)

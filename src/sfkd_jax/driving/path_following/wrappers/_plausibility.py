@@ -117,7 +117,7 @@ class Plausibility:
     Attributes:
         dt: sampling period [s].
         box: of ξ, in which the model predicts; None without one.
-        patience: longest time on the nominal model [s].
+        patience: longest time on the prediction [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
         gain: of the estimate that is kept of each step.
@@ -270,7 +270,8 @@ class Plausibility:
     def _reach(self, state: GateState, periods: Scalar) -> Scalar:
         """Return how far the vehicle gets in a step, and somewhat more [m]."""
         speed = jnp.abs(state.expected[PATH_SPEED])
-        return (1.3 * speed * self.dt + 0.2) * jnp.maximum(periods, 1.0)
+        way = (1.0 + SLIP) * speed * self.dt + ALONG_NOISE
+        return way * jnp.maximum(periods, 1.0)
 
     def _limit(
         self, state: GateState, periods: Scalar, on_time: Bool[Array, ""]

@@ -51,7 +51,7 @@ seen, as a share of the width of the box.
 """
 
 
-class Onward(NamedTuple):
+class PredictedStep(NamedTuple):
     """What is predicted of one step.
 
     Attributes:
@@ -100,7 +100,7 @@ def periods_ahead(
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """The nominal model of a closed loop, step by step, under given commands.
+    """The prediction of a closed loop by its model, under given commands.
 
     Attributes:
         model: of the closed loop, in path coordinates.
@@ -131,15 +131,15 @@ class Prediction:
             turn = self.law.turn(period.road[0], period.road[1], env)
             feedback = turn.feedback(xi)
             control = jnp.where(jnp.isnan(period.control), feedback, period.control)
-            after = self.onward(fiber, turn, period.road, xi, control).xi
-            way = self.way(xi, period.road)
-            step = difference(after, xi)
-            return xi + period.share * step, period.share * way
+            after = self.step(fiber, turn, period.road, xi, control).xi
+            progress = self.progress(xi, period.road)
+            change = difference(after, xi)
+            return xi + period.share * change, period.share * progress
 
         xi, distances = jax.lax.scan(advance, xi, periods)
         return xi, jnp.sum(distances)
 
-    def onward(
+    def step(
         self,
         fiber: Fiber,
         turn: SteadyTurn,
@@ -147,7 +147,7 @@ class Prediction:
         xi: PathState,
         control: Control,
         unseen: Bool[Array, ""] | bool = False,
-    ) -> Onward:
+    ) -> PredictedStep:
         """Predict ξ one step later.
 
         Args:
@@ -161,7 +161,7 @@ class Prediction:
         nu = control - turn.feedback(xi)
         coasting = self._turning(turn, xi, control, road)
         if fiber is None:
-            return Onward(coasting, jnp.asarray(False))
+            return PredictedStep(coasting, jnp.asarray(False))
         after = expected_coordinates(self.model, fiber, xi, nu, road)
         finite = all_finite(after)
         usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
@@ -177,10 +177,10 @@ class Prediction:
             covered |= unseen & near
         # The model continues the linear law for larger ν.
         believed = covered & linear & finite
-        return Onward(jnp.where(believed, after, coasting), inside)
+        return PredictedStep(jnp.where(believed, after, coasting), inside)
 
-    def way(self, xi: PathState, road: Float[Array, " 2"]) -> Scalar:
-        """Return the way along the path in one step [m], Δt v cos e_ψ / (1 − κ e_y)."""
+    def progress(self, xi: PathState, road: Float[Array, " 2"]) -> Scalar:
+        """Return the progress of one step [m], Δt v cos e_ψ / (1 − κ e_y)."""
         scale = jnp.maximum(1.0 - road[0] * xi[LATERAL], SMALLEST_SCALE)
         return self.dt * xi[PATH_SPEED] * jnp.cos(xi[HEADING]) / scale
 
@@ -192,7 +192,7 @@ class Prediction:
         road: Float[Array, " 2"],
     ) -> PathState:
         """Return ξ one step later of a vehicle that keeps its speed and curvature."""
-        path_turned = road[0] * self.way(xi, road)
+        path_turned = road[0] * self.progress(xi, road)
         turned = self.dt * xi[PATH_SPEED] * control[0] / turn.grip[0] - path_turned
         middle = xi[HEADING] + 0.5 * turned
         sideways = self.dt * xi[PATH_SPEED] * jnp.sin(middle)
@@ -204,7 +204,7 @@ class Prediction:
 class Predictor(Stateful):
     """A controller along a path that acts on the state at which its command will act.
 
-        ξ̂(t + d) = F(… F(ξ(t); u_{-n}) …; u_{-1})
+        ξ̂(t + d) = F(… F(ξ(t); u_{-n}) …; u_{-1}),   with the F of `prediction`
 
     The commands that were sent since the observation are known, so the model predicts
     what they do. The controller inside sees ξ̂ and the road from there on, as if nothing
