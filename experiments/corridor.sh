@@ -19,6 +19,7 @@ for vehicle in dynamic kinematic; do
     +experiment=s3 vehicle="$vehicle" name="corridor_$vehicle"
     training.steps=20000 "${of_vehicle[@]}"
     certification.corridor.runs=300 certification.corridor.attack_steps=1000000
+    'certification.corridor.later=[0.1,0.2,0.3]'
     evaluation.episodes=16 "$@"
   )
   python -m sfkd_jax.certify "${run[@]}"

@@ -32,6 +32,22 @@ def test_the_acting_command_is_the_mean_of_what_acts(periods, period):
         np.testing.assert_allclose(acting[control], expected, atol=5e-3)
 
 
+@pytest.mark.parametrize("periods", [(0.0, 0.0), (1.0, 1.0), (0.3, 2.45)])
+def test_of_a_delay_that_may_be_wrong_every_hypothesis_is_another_delay(periods):
+    delay = CommandDelay(periods, tolerance=1.5)
+    assert delay.hypotheses[-1] == 1.5
+    assert 0.0 in delay.hypotheses
+    assert min(delay.hypotheses) + delay.first >= 0.0
+    random = np.random.default_rng(0)
+    commands = random.normal(size=(delay.steps + 1, 2)).astype(np.float32)
+    sent = jnp.asarray(commands[:-1])
+    now = jnp.asarray(commands[-1])
+    for later in delay.hypotheses:
+        true = CommandDelay(tuple(max(one + later, 0.0) for one in periods))
+        found = delay.acting(sent, now, later=jnp.asarray(later))
+        np.testing.assert_allclose(found, true.acting(sent, now), atol=1e-6)
+
+
 def test_before_the_first_command_the_present_one_acts():
     delay = CommandDelay((1.5, 0.0))
     sent = jnp.full((delay.steps, 2), jnp.nan)

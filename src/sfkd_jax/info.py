@@ -75,8 +75,8 @@ _ADVICE = {
         "have changed."
     ),
     Reason.TRIAL: (
-        "A measurement that nothing explains was believed a short time ago; the claim "
-        "returns if what follows agrees with it."
+        "A measurement that nothing explains was believed a short time ago, or another "
+        "latency was found; the claim returns if what follows agrees with it."
     ),
     Reason.NOT_STARTED: "No complete measurement has come yet.",
     Reason.OUTSIDE_BOX: (
@@ -190,12 +190,14 @@ class GateInfo(NamedTuple):
         innovation: measured less predicted ξ, (coordinate,); NaN without a comparison.
         statistic: of the test of the innovations, above 1 an alarm; NaN without a test.
         alarm: whether system or sensors are not those of the calibration.
+        later: periods by which commands act later than stated, as estimated.
     """
 
     measured: Bool[Array, " coordinate"]
     innovation: Float[Array, " coordinate"]
     statistic: Scalar
     alarm: Flag
+    later: Scalar
 
 
 class AdaptationInfo(NamedTuple):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import along_arc
 from sfkd_jax.ranges import Interval, MayBeEmpty, check_intervals
-from sfkd_jax.types import BODY, POSE, Control, State
+from sfkd_jax.types import BODY, POSE, Control, Scalar, State
 
 Delay = Annotated[float, Interval("[0, 2]")]
 """A delay [s]."""
@@ -82,14 +82,18 @@ class Latency:
         """Return the delays of the commands after the call that returns them."""
         return CommandDelay(tuple(_periods(delay, dt) for delay in self.controls))
 
-    def loop(self, dt: float) -> CommandDelay:
+    def loop(self, dt: float, tolerance: float = 0.0) -> CommandDelay:
         """Return the delays of the commands after the oldest entry of an observation.
 
         A controller that holds the younger entries back sees states of that one time.
+
+        Args:
+            dt: sampling period [s].
+            tolerance: largest error of the delays [s].
         """
         oldest = max(self.sensors, default=0.0)
         delays = tuple(_periods(oldest + delay, dt) for delay in self.controls)
-        return CommandDelay(delays)
+        return CommandDelay(delays, _periods(tolerance, dt))
 
 
 NO_LATENCY = Latency()
@@ -100,24 +104,43 @@ NO_LATENCY = Latency()
 class CommandDelay:
     """When commands act, counted from the time of an observation.
 
+    The delays that are stated may be wrong by up to `tolerance`. `later` is then by how
+    much the commands really act later, and may be estimated while driving.
+
     Attributes:
-        periods: delay of every control, in sampling periods. () stands for none.
+        periods: stated delay of every control, in sampling periods. () stands for none.
+        tolerance: largest error of these delays, in sampling periods.
     """
 
     periods: tuple[float, ...] = ()
+    tolerance: float = 0.0
 
     @property
     def steps(self) -> int:
-        """Number of earlier commands that still act after an observation."""
-        return ceil(max(self.periods, default=0.0))
+        """Number of earlier commands that may still act after an observation."""
+        return ceil(max(self.periods, default=0.0) + self.tolerance)
 
     @property
     def first(self) -> float:
         """Periods until the first control acts, to which a controller predicts."""
         return self.periods[0] if self.periods else 0.0
 
+    @property
+    def hypotheses(self) -> tuple[float, ...]:
+        """By how many periods the commands may act later than stated, in halves.
+
+        They never act before they are sent.
+        """
+        halves = round(2.0 * self.tolerance)
+        later = (0.5 * half for half in range(-halves, halves + 1))
+        return tuple(one for one in later if one >= -self.first)
+
     def acting(
-        self, sent: Float[Array, "step control"], control: Control, period: int = 0
+        self,
+        sent: Float[Array, "step control"],
+        control: Control,
+        period: int = 0,
+        later: Scalar | float = 0.0,
     ) -> Control:
         """Return the mean command over a period after an observation.
 
@@ -126,20 +149,25 @@ class CommandDelay:
                 stands for the command of this call.
             control: the command of this call, which also stands for later ones.
             period: 0 for the period that begins at the observation, and so on.
+            later: periods by which the commands act later than stated.
         """
         if not self.steps:
             return control
         last = sent[len(sent) - self.steps :]
         known = jnp.where(jnp.isnan(last), control, last)
         commands = jnp.concatenate([known, control[None]])
-        return jnp.sum(self._shares(period) * commands, axis=0)
+        return jnp.sum(self._shares(period, later) * commands, axis=0)
 
-    def _shares(self, period: int) -> Float[np.ndarray, "command control"]:
+    def _shares(
+        self, period: int, later: Scalar | float
+    ) -> Float[Array, "command control"]:
         """Return the shares of a period during which each command acts."""
-        starts = np.arange(-self.steps, 1)[:, None] + np.asarray(self.periods)
-        ends = np.append(starts[1:], np.full((1, starts.shape[1]), np.inf), axis=0)
-        overlap = np.minimum(ends, period + 1) - np.maximum(starts, period)
-        return np.maximum(overlap, 0.0)
+        delays = jnp.maximum(jnp.asarray(self.periods or (0.0,)) + later, 0.0)
+        starts = jnp.arange(-self.steps, 1)[:, None] + delays
+        never = jnp.full((1, starts.shape[1]), jnp.inf)
+        ends = jnp.concatenate([starts[1:], never])
+        overlap = jnp.minimum(ends, period + 1) - jnp.maximum(starts, period)
+        return jnp.maximum(overlap, 0.0)
 
 
 ON_TIME = CommandDelay()

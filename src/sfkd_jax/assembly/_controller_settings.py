@@ -8,7 +8,7 @@ from typing import Any
 
 from sfkd_jax import control, paper
 from sfkd_jax.driving import path_following
-from sfkd_jax.latency import ON_TIME, CommandDelay
+from sfkd_jax.latency import ON_TIME, CommandDelay, Delay
 from sfkd_jax.settings import Values, arguments, choose, parse, schema, takes
 from sfkd_jax.types import Controller
 
@@ -99,6 +99,8 @@ class SearchSettings(ControllerSettings):
     Attributes:
         shield: whether plans are kept inside the corridor of a certificate.
         adaptive: whether unmeasured forces are estimated while driving.
+        latency_tolerance: error of the stated latency up to which the true one is
+            estimated while driving [s]; along a path, with a corridor.
         feedback: of `path_following.path_feedback`.
         gate: of `path_following.Gate`.
         adaptation: of `path_following.Adaptation`.
@@ -106,6 +108,7 @@ class SearchSettings(ControllerSettings):
 
     shield: bool = False
     adaptive: bool = False
+    latency_tolerance: Delay = 0.2
     feedback: Any = None
     gate: Any = None
     adaptation: Any = None

@@ -108,7 +108,12 @@ def build_controller(
             "a model in path coordinates needs controller.sampling=law and its law"
         )
     sized = latency.sized(len(plant.states), len(plant.controls))
-    loop = _Loop(model, plant, law, env_box, estimates_env, sized)
+    tolerance = 0.0
+    # It is estimated from innovations, which only a corridor has calibrated.
+    if certificate is not None and certificate.corridor is not None:
+        tolerance = 0.0 if estimates_env else settings.latency_tolerance
+    delay = sized.loop(plant.dt, tolerance)
+    loop = _Loop(model, plant, law, env_box, estimates_env, sized, delay)
     return _layers(settings, loop, certificate, adaptive=adaptive, planner=planner)
 
 
@@ -138,7 +143,7 @@ def _layers(
         inner = in_corridor(
             inner, certified, loop.plant, loop.law, certificate, latency=loop.latency
         )
-    if loop.delay.first:
+    if loop.delay.steps:
         inner = _predicting(inner, predicting, loop, certificate)
     if adaptive:
         inner = _adapting(inner, settings, loop)
@@ -155,6 +160,7 @@ class _Loop(NamedTuple):
         env_box: corners env_low and env_high of the box of e, None if unknown.
         estimates_env: whether e is estimated while driving, not measured.
         latency: of the vehicle, for each state and control.
+        delay: of the commands after an observation.
     """
 
     model: Model
@@ -163,11 +169,7 @@ class _Loop(NamedTuple):
     env_box: dict[str, Any]
     estimates_env: bool
     latency: Latency
-
-    @property
-    def delay(self) -> CommandDelay:
-        """The delays of the commands after an observation."""
-        return self.latency.loop(self.plant.dt)
+    delay: CommandDelay
 
 
 def _as_floats(corner: Corner) -> tuple[float, ...] | None:
@@ -346,7 +348,10 @@ def _along_reference(
     tests = path_following.MeasurementTests()
     if certificate is not None and certificate.corridor is not None:
         tests = measurement_tests(
-            certificate.corridor, loop.plant, estimates_env=loop.estimates_env
+            certificate.corridor,
+            loop.plant,
+            estimates_env=loop.estimates_env,
+            later=loop.delay.hypotheses,
         )
     gate = path_following.Gate(
         inner=inner,

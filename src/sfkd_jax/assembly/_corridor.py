@@ -56,8 +56,8 @@ def in_corridor(
         plant: vehicle, whose limits the controls keep.
         law: around which the model was learned.
         certificate: with a corridor.
-        latency: of the vehicle. Nothing is claimed if it is not that of the
-            certificate.
+        latency: of the vehicle. Nothing is claimed if the certificate has no corridor
+            for it.
     """
     corridor = corridor_of(certificate)
     bounds = corridor.bounds
@@ -65,9 +65,7 @@ def in_corridor(
     # Until the command acts, an error of the heading moves the car sideways.
     way = corridor.conditions.speed[1] * plant.dt * latency.loop(plant.dt).first
     lateral_noise = math.hypot(lateral_noise, way * heading_noise)
-    sizes = (len(plant.states), len(plant.controls))
-    latency = latency.sized(*sizes)
-    calibrated = corridor.conditions.latency.sized(*sizes)
+    tubes = _tubes(corridor, plant, latency)
     # What the heading's noise moves the car sideways until the law has turned it back.
     steering = np.asarray(law.gain)[..., 0, :]
     ratio = float(np.max(steering[..., HEADING] / steering[..., LATERAL]))
@@ -76,7 +74,8 @@ def in_corridor(
         model=model,
         law=law,
         width=bounds.nominal,
-        tube=bounds.vehicle_to_nominal_position,
+        tube=tubes[0][1] if tubes else bounds.vehicle_to_nominal_position,
+        late=tubes,
         horizon=corridor.shield_horizon,
         noise_allowance=ALLOWANCE * lateral_noise,
         start_error=ALLOWANCE * (lateral_noise + ratio * heading_noise),
@@ -85,12 +84,47 @@ def in_corridor(
         conditions=conditions_of(certificate),
         dt=plant.dt,
         rear=_slip_of_gentle_turns(law),
-        claimed=corridor.is_claimed and calibrated == latency,
+        claimed=corridor.is_claimed and bool(tubes),
     ).controller()
 
 
+def _tubes(
+    corridor: Corridor, plant: plants.Vehicle, latency: Latency
+) -> tuple[tuple[float, float], ...]:
+    """Return the tubes of a corridor by how much later a vehicle is than stated.
+
+    Args:
+        corridor: in force.
+        plant: vehicle.
+        latency: that is stated.
+
+    Returns:
+        Pairs of periods and tube [m], rising. A tube holds for vehicles that are later
+        by up to so many periods. It is empty if the corridor is of another latency.
+    """
+    sizes = (len(plant.states), len(plant.controls))
+    stated = latency.sized(*sizes).loop(plant.dt).periods
+    calibrated = corridor.conditions.latency.sized(*sizes).loop(plant.dt).periods
+    gaps = [mine - theirs for mine, theirs in zip(stated, calibrated, strict=True)]
+    # A corridor says nothing about vehicles that are less late.
+    if min(gaps) < 0.0:
+        return ()
+    tubes = [(0.0, corridor.bounds.vehicle_to_nominal_position)]
+    for late in corridor.late:
+        # The shield keeps the nominal corridor of the conditions, whatever is late.
+        tube = late.corridor_m - corridor.bounds.nominal
+        tubes.append((round(late.later_s / plant.dt, 9), tube))
+    return tuple(
+        (periods - max(gaps), tube) for periods, tube in tubes if periods >= max(gaps)
+    )
+
+
 def measurement_tests(
-    corridor: Corridor, plant: plants.Vehicle, *, estimates_env: bool
+    corridor: Corridor,
+    plant: plants.Vehicle,
+    *,
+    estimates_env: bool,
+    later: tuple[float, ...] = (0.0,),
 ) -> path_following.MeasurementTests:
     """Return the tests of a vehicle and its sensors, as a corridor calibrated them.
 
@@ -99,6 +133,7 @@ def measurement_tests(
         plant: vehicle.
         estimates_env: whether e is estimated while driving. The innovations are then
             not those of the calibration, and are not tested.
+        later: delays that the test of the innovations compares.
     """
     names = plant.state_names
     noise = (*corridor.conditions.sensor_noise, *(0.0 for _ in names))[: len(names)]
@@ -114,7 +149,7 @@ def measurement_tests(
         return path_following.MeasurementTests(odometry=odometry)
     calibrated = corridor.innovations
     innovation = path_following.innovation_test(
-        calibrated.levels, calibrated.deviation, calibrated.threshold
+        calibrated.levels, calibrated.deviation, calibrated.threshold, later
     )
     return path_following.MeasurementTests(innovation, odometry)
 

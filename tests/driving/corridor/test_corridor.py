@@ -105,7 +105,7 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
         boxes=boxes,
         level=0.9,
     )
-    small = {"runs": 24, "duration": 4.0, "attack_steps": 3000}
+    small = {"runs": 24, "duration": 4.0, "attack_steps": 3000, "later": (0.1,)}
     corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, **small)
     settings = {
         "space": path_space()._asdict(),
@@ -133,6 +133,9 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     assert corridor.conditions.acceleration == 2.0
     assert again.corridor.conditions.latency == late.sized(4, 2)
     assert len(again.corridor.margins.delay_s) == len(again.corridor.margins.speed)
+    (later,) = again.corridor.late
+    assert later.later_s == 0.1
+    assert later.corridor_m > corridor.bounds.nominal
     groups = corridor.by_group
     assert list(groups) == ["bends", "speeds", "lane_changes"]
     # The claim is that of the worst group.

@@ -7,6 +7,7 @@ import pytest
 from sfkd_jax.driving.path_coordinates import curvature_ahead, projected
 from sfkd_jax.driving.path_following.tasks._preview import (
     Preview,
+    later,
     road_from,
     state_beside,
 )
@@ -30,6 +31,7 @@ def preview(begins, speed=SPEED):
         observation=state,
         reference=reference,
         sent=jnp.zeros((0, 2)),
+        later=jnp.zeros(()),
         repeated=jnp.asarray(False),
         measured=jnp.ones(3, bool),
         on_time=jnp.asarray(True),
@@ -70,3 +72,13 @@ def test_a_state_beside_the_reference_has_its_own_coordinates(ahead):
     np.testing.assert_allclose(place, along, atol=0.02)
     foot = point_at(PATH, jnp.asarray(20.0 + ahead))
     assert abs(float(jnp.hypot(*(state - foot)[:2])) - 0.2) < 0.02
+
+
+def test_rows_of_later_on_are_between_rows_and_beyond_the_last_one_it_stays():
+    yaw = jnp.asarray([3.0, 3.1, -np.pi + 0.05, -np.pi + 0.15])
+    rows = jnp.stack([jnp.arange(4.0), yaw], axis=1)
+    moved = later(rows, jnp.asarray(1.5), 3, angle=1)
+    np.testing.assert_allclose(moved[:, 0], [1.5, 2.5, 3.0])
+    turned = moved[:, 1] - jnp.asarray([3.1458, np.pi + 0.1, np.pi + 0.15])
+    np.testing.assert_allclose(np.sin(turned), 0.0, atol=1e-4)
+    np.testing.assert_array_equal(later(rows, 0.0, 4, angle=1), rows)

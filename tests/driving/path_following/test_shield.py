@@ -17,6 +17,7 @@ from sfkd_jax.driving import path_following, paths, scenarios
 from sfkd_jax.driving.certificate import (
     DrivingCertificate,
     JointBounds,
+    LateCorridor,
     Recorded,
     RecordedConditions,
 )
@@ -25,6 +26,7 @@ from sfkd_jax.driving.path_following import Conditions, along_reference, safety_
 from sfkd_jax.driving.plants import kinematic
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
+from sfkd_jax.latency import Latency
 from sfkd_jax.policy import SHIPPED
 from sfkd_jax.rollout import unfold
 from sfkd_jax.types import BODY, Controller, Model
@@ -465,8 +467,9 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     monkeypatch.setattr(path_following, "Shield", record)
     in_corridor = partial(assembly.in_corridor, scripted(), TOY, kinematic(), LAW)
 
-    def build_with(corridor):
-        in_corridor(replace(certificate, measured=measured, corridor=corridor))
+    def build_with(corridor, **options):
+        corridor = replace(certificate, measured=measured, corridor=corridor)
+        in_corridor(corridor, **options)
 
     build_with(corridor)
     low, high = made["conditions"].state
@@ -475,6 +478,21 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     assert high == pytest.approx((0.4, 0.15, 12.0))
     expected = (0.08, 0.06, pytest.approx(0.03))
     assert (made["width"], made["tube"], made["noise_allowance"]) == expected
+    # A vehicle that is later has the tube that was measured for it.
+    wider = JointBounds(
+        nominal=0.09, vehicle_to_nominal_position=0.11, vehicle_to_nominal_yaw=0.0
+    )
+    row = LateCorridor(later_s=0.2, bounds=wider, coverage=corridor.coverage)
+    late = replace(corridor, late=(row,))
+    build_with(late)
+    assert made["tube"] == 0.06
+    assert made["late"] == ((0.0, 0.06), (2.0, pytest.approx(0.12)))
+    build_with(late, latency=Latency((0.1,), (0.05,)))
+    assert made["claimed"]
+    assert made["tube"] == pytest.approx(0.12)
+    assert made["late"] == ((pytest.approx(0.5), pytest.approx(0.12)),)
+    build_with(late, latency=Latency((0.3,)))
+    assert not made["claimed"]
     # Measured on a model of logs, it claims nothing of the car before its own runs do.
     identified = replace(corridor.conditions, identified_from="contents")
     corridor = replace(corridor, conditions=identified)
@@ -678,6 +696,33 @@ def test_the_bound_of_a_start_at_a_measurement_decays_to_the_certified_one():
     corridor = np.asarray(info.claim.bound)
     expected = WIDTH + TUBE + 0.05 * 0.9 ** np.arange(60)
     np.testing.assert_allclose(corridor, expected, rtol=1e-5)
+
+
+def test_of_a_vehicle_that_is_later_the_bound_of_that_delay_is_claimed():
+    """Nothing is claimed where none is known."""
+    wider = 0.3
+    options = {"tube": TUBE, "late": ((0.0, TUBE), (1.0, wider))}
+    options |= {"inner": scripted(), "model": TOY, "law": LAW, "width": WIDTH}
+    shield = path_following.Shield(control=(LOW, HIGH), **options).controller()
+
+    @jit
+    def claim(later):
+        def act(params, state, xi, env, preview):
+            return shield.act(params, state, xi, env, preview._replace(later=later))
+
+        controller = gated(Controller(shield.init, act))
+        start = controller.init(jax.random.key(0))
+        seen = vehicle_state(jnp.asarray([0.1, 0.0, SPEED]))
+        script = jnp.zeros((1, 2))
+        return controller.act(script, start, seen, ENV, circle())[2].claim
+
+    for later, tube in ((0.0, TUBE), (0.5, wider), (1.0, wider)):
+        bound = claim(jnp.asarray(later)).bound
+        np.testing.assert_allclose(bound, WIDTH + tube, rtol=1e-6)
+    for unknown in (1.5, -0.5):
+        nothing = claim(jnp.asarray(unknown))
+        assert nothing.reason == Reason.NOT_CALIBRATED
+        assert np.isnan(nothing.bound)
 
 
 def test_before_the_first_environment_the_law_drives_with_the_middle_of_its_box():

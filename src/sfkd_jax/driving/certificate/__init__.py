@@ -10,6 +10,7 @@ from sfkd_jax.driving.certificate._corridor import CorridorAttack as CorridorAtt
 from sfkd_jax.driving.certificate._corridor import GroupBounds as GroupBounds
 from sfkd_jax.driving.certificate._corridor import Innovations as Innovations
 from sfkd_jax.driving.certificate._corridor import JointBounds as JointBounds
+from sfkd_jax.driving.certificate._corridor import LateCorridor as LateCorridor
 from sfkd_jax.driving.certificate._corridor import LawMargins as LawMargins
 from sfkd_jax.driving.certificate._corridor import Recorded as Recorded
 from sfkd_jax.driving.certificate._corridor import (

@@ -217,6 +217,29 @@ class LawMargins:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LateCorridor:
+    """The corridor of a vehicle that is later than the conditions say.
+
+    The controller compensates its latency. No attack is made on this corridor.
+
+    Attributes:
+        later_s: delay in addition to the latency of the conditions, of all sensors or
+            of all controls [s].
+        bounds: of the worse of both.
+        coverage: of the worst group.
+    """
+
+    later_s: Positive
+    bounds: JointBounds
+    coverage: Coverage
+
+    @property
+    def corridor_m(self) -> float:
+        """Half width [m], the nominal bound and the tube."""
+        return self.bounds.nominal + self.bounds.vehicle_to_nominal_position
+
+
+@dataclass(frozen=True, kw_only=True)
 class Corridor:
     """How far the vehicle stays from its path, whatever a planner behind a shield does.
 
@@ -237,6 +260,7 @@ class Corridor:
         seconds: that the measurements took [s].
         recorded: corridor of recorded runs of the car, or None.
         margins: of the law; None in certificates from before they were measured.
+        late: of vehicles that are later, by rising delays.
     """
 
     conditions: Conditions
@@ -255,6 +279,7 @@ class Corridor:
     seconds: NonNegative
     recorded: Recorded | None = None
     margins: LawMargins | None = field(default=None, metadata=ADDED)
+    late: tuple[LateCorridor, ...] = field(default=(), metadata=ADDED)
 
     @property
     def is_claimed(self) -> bool:
@@ -264,7 +289,8 @@ class Corridor:
     def in_force(self) -> Corridor:
         """Return the corridor with the bounds that hold for the vehicle.
 
-        These are the bounds of recorded runs, if there are any.
+        These are the bounds of recorded runs, if there are any. No run of that vehicle
+        was later.
         """
         if self.recorded is None:
             return self
@@ -274,4 +300,5 @@ class Corridor:
             bounds=replace(self.bounds, **vars(recorded.bounds)),
             corridor_m=recorded.corridor_m,
             level=recorded.level,
+            late=(),
         )

@@ -11,20 +11,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
 
 from sfkd_jax.certificate import OutputMetric
 from sfkd_jax.certification import (
-    FORMS,
-    OUTPUTS,
     conformal_bounds,
-    radii,
-    residuals,
     rows,
 )
 from sfkd_jax.driving.certificate import (
@@ -33,9 +27,9 @@ from sfkd_jax.driving.certificate import (
     Corridor,
     GroupBounds,
     JointBounds,
+    LateCorridor,
     Recorded,
     RecordedConditions,
-    Seen,
 )
 from sfkd_jax.driving.corridor._alarms import (
     calibrate_innovations,
@@ -48,27 +42,30 @@ from sfkd_jax.driving.corridor._bounds import (
     calibrate_corridor,
     corridor_coverage,
 )
-from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
+from sfkd_jax.driving.corridor._closed_loop import Loop
 from sfkd_jax.driving.corridor._margins import law_margins
+from sfkd_jax.driving.corridor._runs import (
+    EXCITATION,
+    ROAD_SETTINGS,
+    Driver,
+    drivers_of,
+    measure_runs,
+)
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
-from sfkd_jax.driving.drives import Reading, drive_along_path, from_s3
-from sfkd_jax.driving.path_coordinates import LATERAL
-from sfkd_jax.driving.scenarios import DRIVES, DriveClass, random_switching
+from sfkd_jax.driving.drives import Reading
+from sfkd_jax.driving.scenarios import DRIVES
+from sfkd_jax.latency import Delays, Latency
 from sfkd_jax.ranges import Interval, Span
-from sfkd_jax.types import BODY, Key, Trajectory
+from sfkd_jax.types import Key
 
-ROAD_SETTINGS = DriveClass._fields
-"""Settings of the data set that say which class its drives are of."""
-EXCITATION = ("steering_excitation", "speed_excitation")
-"""Settings of the data set that say how ν is drawn."""
 STREAM = 4
 """Number that is folded into the data set's seed for the corridor. The data set itself
 uses the streams 0 to 2.
 """
 ALARM_STREAM = 5
 """The same for the test of innovations."""
-Driver: TypeAlias = Callable[[Key], tuple[Trajectory, Reading | None]]
-"""key -> runs, and what the law has read on them."""
+LATE_STREAM = 6
+"""The same for the corridors of vehicles that are later than stated."""
 
 
 def measure_corridor(
@@ -82,6 +79,7 @@ def measure_corridor(
     dwell: Span = (3.0, 6.0),
     horizon: int = 20,
     attack_steps: int = 200_000,
+    later: Delays = (),
     identified_from: str | None = None,
 ) -> Corridor:
     """Return the corridor of a policy, measured on simulated runs.
@@ -101,6 +99,8 @@ def measure_corridor(
         dwell: range of times between switches [s].
         horizon: preview of the shield [steps].
         attack_steps: number of steps of the search for runs that leave the corridor.
+        later: delays beyond the latency of the loop, for each of which the corridor is
+            measured as well [s].
         identified_from: hash of the logs if the plant is a model of logs.
 
     Raises:
@@ -111,12 +111,12 @@ def measure_corridor(
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    drive, drive_s3 = _drivers(loop, data, runs, duration, dwell)
+    drive, drive_s3 = drivers_of(loop, data, runs, duration, dwell)
     simulate = jax.jit(partial(simulate_nominal, loop))
     drivers = (drive, drive, drive, drive_s3)
     sensor_keys = jax.random.split(sensor_key, len(drivers))
     units, calibration, test, s3 = (
-        _measure(loop, claims, simulate, driver(run_key)[0], key)
+        measure_runs(loop, claims, simulate, driver(run_key)[0], key)
         for driver, run_key, key in zip(drivers, run_keys, sensor_keys, strict=True)
     )
     bounds, groups = _bounds_of_groups(
@@ -129,6 +129,11 @@ def measure_corridor(
     observe = partial(_observed, jax.jit(partial(innovations, loop)))
     observers = (partial(observe, drive), partial(observe, drive_s3))
     alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
+    settings = data, runs, duration, dwell
+    late = [
+        _late_corridor(loop, delay, claims, level, settings, stream(LATE_STREAM))
+        for delay in later
+    ]
     coverages = [group.coverage for group in groups.values()]
     return Corridor(
         conditions=_conditions(loop, data, duration, dwell, identified_from),
@@ -147,8 +152,60 @@ def measure_corridor(
         failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
         shield_horizon=horizon,
         margins=law_margins(loop, data),
+        late=tuple(late),
         seconds=time.perf_counter() - began,
     )
+
+
+def _late_corridor(
+    loop: Loop,
+    delay: float,
+    claims: Mapping[str, OutputMetric],
+    level: float,
+    settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
+    key: Key,
+) -> LateCorridor:
+    """Return the corridor of a loop that is later, and compensates it.
+
+    The worse of two loops counts: all sensors are later, or all controls.
+
+    Args:
+        loop: of the policy.
+        delay: in addition to the latency of the loop [s].
+        claims: proved metrics by the names of the outputs.
+        level: 1 − δ.
+        settings: of the drivers, see `drivers_of`.
+        key: consumed.
+    """
+    sensors = tuple(delay + one for one in loop.latency.sensors)
+    controls = tuple(delay + one for one in loop.latency.controls)
+    latencies = (
+        Latency(sensors, loop.latency.controls),
+        Latency(loop.latency.sensors, controls),
+    )
+    corridors = []
+    for latency in latencies:
+        later = loop._replace(latency=latency)
+        driver, _ = drivers_of(later, *settings)
+        simulate = jax.jit(partial(simulate_nominal, later))
+        scores = []
+        for part in range(3):
+            run_key, sensor_key = jax.random.split(jax.random.fold_in(key, part))
+            runs, _ = driver(run_key)
+            scores.append(
+                measure_runs(later, claims, simulate, runs, sensor_key).scores
+            )
+        units, calibration, test = scores
+        bounds, groups = _bounds_of_groups(units, calibration, test, level)
+        coverages = [group.coverage for group in groups.values()]
+        corridors.append(
+            LateCorridor(
+                later_s=delay,
+                bounds=JointBounds(**{name: getattr(bounds, name) for name in JOINT}),
+                coverage=min(coverages, key=lambda coverage: coverage.share),
+            )
+        )
+    return max(corridors, key=lambda corridor: corridor.corridor_m)
 
 
 def _conditions(
@@ -176,67 +233,6 @@ def _conditions(
         identified_from=identified_from,
         latency=loop.latency,
     )
-
-
-def _drivers(
-    loop: Loop,
-    data: Mapping[str, Any],
-    runs: int,
-    duration: float,
-    dwell: tuple[float, float],
-) -> tuple[Driver, Driver]:
-    """Return drivers under the conditions, and on S3; compiled.
-
-    Each makes `runs` runs of every group, group after group.
-    """
-    low = data["env_low"]
-    high = data["env_high"]
-    dt = loop.plant.dt
-    steps = round(duration / dt)
-    switching = partial(
-        random_switching, steps=steps, dt=dt, low=low, high=high, dwell=dwell
-    )
-    groups = jnp.repeat(jnp.arange(len(DRIVES)), runs)
-    driver = partial(_driver, loop, data, groups)
-    return driver(switching), driver(from_s3(steps, dt, low, high))
-
-
-def _driver(
-    loop: Loop,
-    data: Mapping[str, Any],
-    groups: Int[Array, " run"],
-    conditions: Callable[[Key], Array],
-) -> Driver:
-    """Return key -> runs of the groups, each in an environment of its own; compiled."""
-    drive = partial(
-        drive_along_path,
-        loop.plant,
-        limits=DriveClass(**drive_class(data)),
-        sensors=law_sensors(loop),
-        offset=(0.0, 0.0, 0.0),
-        burn_in=0,
-        **{name: data[name] for name in EXCITATION},
-    )
-
-    def driven(key: Key) -> tuple[Trajectory, Reading | None]:
-        env_key, run_key = jax.random.split(key)
-        envs = jax.vmap(conditions)(jax.random.split(env_key, len(groups)))
-        return drive(envs, run_key, groups=groups)
-
-    return jax.jit(driven)
-
-
-def scores_of_runs(
-    loop: Loop, claims: Mapping[str, OutputMetric], runs: Trajectory
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the scores of recorded runs and their e_y (run, time).
-
-    They are computed as those of simulated runs. The state of the vehicle is what its
-    sensors show, for the nominal model too.
-    """
-    simulate = jax.jit(partial(simulate_nominal, loop))
-    measured = _measure(loop, claims, simulate, runs, jax.random.key(0))
-    return measured.scores, measured.lateral
 
 
 def calibrate_on_runs(
@@ -268,11 +264,6 @@ def calibrate_on_runs(
         level=level,
         conditions=conditions,
     )
-
-
-def drive_class(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a data set that say which drives a corridor is about."""
-    return {name: data[name] for name in ROAD_SETTINGS}
 
 
 def _bounds_of_groups(
@@ -311,62 +302,6 @@ def _bounds_of_groups(
         for name, scores in zip(DRIVES, test_of_groups, strict=True)
     }
     return bounds, groups
-
-
-class _Part(NamedTuple):
-    """What is measured on a part of the runs.
-
-    Attributes:
-        lateral: e_y of the car [m].
-        nominal: ê_y of the nominal model [m].
-        scores: the smallest bounds that would have held on each run, in the order of
-            `JOINT` and `ALONE`. They are infinite where a simulator failed: such a run
-            counts as one outside of every bound.
-    """
-
-    lateral: Float[np.ndarray, "run time"]
-    nominal: Float[np.ndarray, "run time"]
-    scores: Float[np.ndarray, "run 5"]
-
-    @property
-    def failed(self) -> int:
-        """Number of runs in which a simulator failed."""
-        return int(np.isinf(self.scores[:, 0]).sum())
-
-    def largest(self) -> Seen:
-        """Return how far the car came from the nominal model and from the path."""
-        return Seen(
-            distance_m=float(np.nanmax(np.abs(self.lateral - self.nominal))),
-            lateral_m=float(np.nanmax(np.abs(self.lateral))),
-        )
-
-
-def _measure(
-    loop: Loop,
-    claims: Mapping[str, OutputMetric],
-    simulate: Callable[..., Any],
-    runs: Trajectory,
-    key: Key,
-) -> _Part:
-    """Measure a part of the runs.
-
-    Args:
-        loop: that drove the runs.
-        claims: proved metrics by the names of the outputs.
-        simulate: `simulate_nominal` of the loop, compiled once for all parts of the
-            same size.
-        runs: of this part.
-        key: of the sensors of the nominal model; consumed.
-    """
-    nominal, start = (np.asarray(part, np.float64) for part in simulate(runs, key))
-    errors = residuals(loop.model, loop.params, runs)
-    bounds = [radii(errors, name, claims[name], start) for name in OUTPUTS]
-    alone, together = ([of_output[form] for of_output in bounds] for form in FORMS)
-    largest_nominal = np.max(np.abs(nominal), axis=1)
-    scores = np.column_stack([*together, largest_nominal, *alone])
-    scores[np.isnan(scores).any(axis=1)] = np.inf
-    states = np.asarray(runs.states, dtype=np.float64)
-    return _Part(states[:, 1:, BODY][..., LATERAL], nominal, scores)
 
 
 def _observed(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from sfkd_jax.certification import (
@@ -39,7 +41,7 @@ def verify_driving(certificate: DrivingCertificate, trained: Trained) -> None:
 
 
 def _require_what_follows(corridor: Corridor) -> None:
-    """Refuse a width that does not follow from the bounds."""
+    """Refuse a width that does not follow from the bounds, and delays without order."""
     for part in filter(None, (corridor, corridor.recorded)):
         # The triangle inequality: from the car to the nominal model, and to the path.
         width = part.bounds.nominal + part.bounds.vehicle_to_nominal_position
@@ -47,6 +49,12 @@ def _require_what_follows(corridor: Corridor) -> None:
             near(part.corridor_m, width, REPEATED),
             "corridor.corridor_m does not follow from its bounds",
         )
+
+    delays = [row.later_s for row in corridor.late]
+    require(
+        all(before < after for before, after in pairwise(delays)),
+        "the delays of corridor.late do not rise",
+    )
 
 
 def _require_sizes(corridor: Corridor, trained: Trained) -> None:

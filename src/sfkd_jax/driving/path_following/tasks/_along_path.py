@@ -140,6 +140,7 @@ class AlongReference(Stateful):
             observation=observation,
             reference=reference,
             sent=state.sent,
+            later=jnp.zeros(()),
             repeated=repeated,
             measured=jnp.isfinite(xi),
             on_time=jnp.asarray(True),
@@ -153,9 +154,11 @@ class AlongReference(Stateful):
         info = reported(info)
         planned = info.plan.states
         if planned is not None:
-            states = jax.vmap(beside)(
-                planned, later(points, self.delay.first, angle=YAW)
-            )
+            passing = self.delay.first
+            if info.gate is not None:
+                passing += info.gate.later
+            ahead = later(points, passing, len(planned), angle=YAW)
+            states = jax.vmap(beside)(planned, ahead)
         else:
             states = reported(info.planner).plan.states
         info = info._replace(plan=info.plan._replace(states=states))

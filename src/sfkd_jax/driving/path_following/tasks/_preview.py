@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import ceil
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -35,6 +34,7 @@ class Preview(NamedTuple):
         reference: in the world, as it came.
         sent: the last commands that may still act, newest last; NaN before the first
             one.
+        later: periods by which commands act later than stated, see `CommandDelay`.
         repeated: whether the observation is bit for bit the last one, like that of a
             sensor that froze.
         measured: which entries of ξ are measured; behind a `Gate` the others are
@@ -49,6 +49,7 @@ class Preview(NamedTuple):
     observation: State
     reference: Reference
     sent: Float[Array, "step control"]
+    later: Scalar
     repeated: Bool[Array, ""]
     measured: Bool[Array, " coordinate"]
     on_time: Bool[Array, ""]
@@ -56,26 +57,31 @@ class Preview(NamedTuple):
 
 
 def later(
-    rows: Float[Array, "step column"], periods: float, *, angle: int | None = None
+    rows: Float[Array, "step column"],
+    periods: Scalar | float,
+    count: int,
+    *,
+    angle: int | None = None,
 ) -> Float[Array, "later column"]:
-    """Return the rows of a reference or a preview some periods later.
+    """Return rows of a reference or a preview from some periods later on.
 
-    Between two rows they are interpolated linearly.
+    Between two rows they are interpolated linearly. The last row stands for those after
+    it.
 
     Args:
         rows: one a period.
         periods: by how many.
+        count: of the rows that are returned.
         angle: column of an angle [rad], which may jump by 2π; None without one.
     """
-    whole = ceil(periods)
-    share = whole - periods
-    after = rows[whole:]
-    if not share:
-        return after
-    gap = rows[whole - 1 : -1] - after
+    last = len(rows) - 1
+    times = jnp.minimum(jnp.arange(count) + periods, last)
+    before = jnp.floor(times).astype(int)
+    first = rows[before]
+    gap = rows[jnp.minimum(before + 1, last)] - first
     if angle is not None:
         gap = gap.at[:, angle].set(wrap_angle(gap[:, angle]))
-    return after + share * gap
+    return first + (times - before)[:, None] * gap
 
 
 def state_beside(xi: PathState, preview: Preview) -> State:

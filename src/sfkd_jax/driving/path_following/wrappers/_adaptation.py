@@ -241,7 +241,7 @@ class Adaptation(Stateful):
             rejected=rejected,
             adapting=adapting,
         )
-        acting = self.delay.acting(preview.sent, control)
+        acting = self.delay.acting(preview.sent, control, later=preview.later)
         belief = belief._replace(applied=Applied(acting, road, env))
         info = reported(info)._replace(adaptation=adaptation)
         return control, AdaptiveState(inner, belief), info

@@ -8,7 +8,6 @@ measured.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -55,6 +54,8 @@ from sfkd_jax.types import (
 
 NO_TESTS = MeasurementTests()
 """No test: nothing raises an alarm."""
+SETTLING = 1.0
+"""Time without a claim after another latency was found [s]."""
 SLOWING = 0.8
 """Speed [m/s] by which the reference of a lost vehicle is below the vehicle's speed."""
 
@@ -141,7 +142,8 @@ class Gate(Stateful):
         horizon: number of steps of the preview.
         reads_env: whether `inner` reads the environment that it is given.
         tests: that raise alarms.
-        delay: of the commands after an observation.
+        delay: of the commands after an observation. Which of its hypotheses holds is
+            estimated by the test of the innovations.
         patience: longest time on the prediction [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
@@ -206,24 +208,33 @@ class Gate(Stateful):
             preview.observation,
             jnp.all(measured) & preview.on_time,
         )
+        later = self.tests.later(tests)
+        # What follows is about another loop.
+        changed = later != self.tests.later(state.tests)
+        doubt = jnp.where(
+            changed, round(SETTLING / self.prediction.dt), believed.state.doubt
+        )
         reason = first(
             inputs.reason,
             (~jnp.all(measured), Reason.NOT_MEASURED),
             (alarm, Reason.ALARM),
-            (believed.state.doubt > 0, Reason.TRIAL),
+            (doubt > 0, Reason.TRIAL),
         )
         road = road_from(preview, believed.along)
         road = self._slowed(road, believed.xi[PATH_SPEED], believed.lost)
         shown = preview._replace(
-            road=road, along=believed.along, measured=measured, reason=reason
+            road=road,
+            along=believed.along,
+            later=later,
+            measured=measured,
+            reason=reason,
         )
         control, inner, info = self.inner.act(
             params, state.inner, believed.xi, inputs.env, shown
         )
         info = reported(info)
-        acting = self.delay.acting(preview.sent, control)
         expected = self._expect(
-            params, inputs, believed, shown, acting, info, tests.innovation
+            params, inputs, believed, shown, control, info, tests.innovation
         )
         innovation = difference(inputs.xi, state.expected)
         info = info._replace(
@@ -234,6 +245,7 @@ class Gate(Stateful):
                 innovation=jnp.where(measured, innovation, jnp.nan),
                 statistic=statistic,
                 alarm=alarm,
+                later=later,
             ),
         )
         after = believed.state._replace(
@@ -241,7 +253,7 @@ class Gate(Stateful):
             expected=expected.xi,
             modelled=expected.modelled,
             place=expected.place,
-            doubt=jnp.maximum(believed.state.doubt - 1, 0),
+            doubt=jnp.maximum(doubt - 1, 0),
             env=inputs.env,
             road=road,
             tests=tests._replace(innovation=expected.test),
@@ -312,7 +324,7 @@ class Gate(Stateful):
             inputs: of this step.
             believed: of the measurement.
             shown: to the controller.
-            control: that acts over the period after the measurement.
+            control: command of this step.
             info: of the controller; an estimator says in it what it estimates.
             test: state of the test of the innovations; None without one.
         """
@@ -320,40 +332,48 @@ class Gate(Stateful):
         here = shown.road[0]
         env = inputs.env
         # What acts is the control and the input error that an estimator counteracts.
-        acting = control
+        error = jnp.zeros_like(control)
         if info.adaptation is not None:
             env = info.adaptation.env
-            acting = control + input_error(info.adaptation.causes, here)
+            error = input_error(info.adaptation.causes, here)
+
+        def acting(later: Scalar) -> Control:
+            return self.delay.acting(shown.sent, control, later=later)
+
         nearest = predict.conditions.nearest(env)
         turn = predict.law.turn(here[0], here[1], nearest)
         fiber = None
         # A model of which nothing is known must not overrule a measurement.
         if predict.conditions.state is not None:
             fiber = predict.model.fiber(fold(predict.model, params), nearest)
-        # From the estimate, for the next step; and from ξ as it is, for the test.
         estimate = believed.state.past[0, :-1]
-        xi = believed.xi
         unseen = ~believed.measured[LATERAL]
-        after = jax.vmap(partial(predict.step, fiber, turn, here))(
-            jnp.stack([estimate, xi]),
-            jnp.stack([control, acting]),
-            jnp.stack([unseen, jnp.asarray(False)]),
-        )
-        if test is not None:
-            rate = turning_rate(predict.law, xi, acting, here, nearest)
-            ahead = jnp.append(after.xi[1], xi[HEADING] + predict.dt * rate)
+        after = predict.step(fiber, turn, here, estimate, acting(shown.later), unseen)
+        if test is not None and self.tests.innovation is not None:
+            # From ξ as it is, under each delay that is possible.
+            xi = believed.xi
+            controls = jax.vmap(acting)(jnp.asarray(self.tests.innovation.later))
+
+            def readings(control: Control) -> tuple[Array, Bool[Array, ""]]:
+                step = predict.step(fiber, turn, here, xi, control)
+                rate = turning_rate(predict.law, xi, control, here, nearest)
+                ahead = jnp.append(step.xi, xi[HEADING] + predict.dt * rate)
+                return ahead, step.inside
+
+            ahead, inside = jax.vmap(readings)(controls + error)
             clear = inputs.reason == Reason.CERTIFIED
             clear = clear & jnp.all(believed.measured)
-            comparable = clear & after.inside[1]
             test = test._replace(
-                expected=jnp.where(comparable, ahead, jnp.nan), level=turn.level
+                expected=jnp.where(clear, ahead, jnp.nan),
+                inside=inside,
+                level=turn.level,
             )
         along = believed.along + predict.progress(estimate, here)
-        place = state_beside(after.xi[0], shown._replace(along=along))[:2]
+        place = state_beside(after.xi, shown._replace(along=along))[:2]
         # In its own frame a vehicle does not move.
         moves = jnp.any(shown.observation[POSE] != 0.0)
         place = jnp.where(moves, place, jnp.nan)
-        return Expected(after.xi[0], after.inside[0], place, test)
+        return Expected(after.xi, after.inside, place, test)
 
 
 def _elapsed(state: Any) -> Scalar:

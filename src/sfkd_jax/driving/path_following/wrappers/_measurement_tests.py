@@ -38,6 +38,12 @@ class MeasurementTests(NamedTuple):
     innovation: InnovationTest | None = None
     odometry: OdometryTest | None = None
 
+    def later(self, state: TestsState) -> Scalar:
+        """Return by how many periods commands act later than stated, as it seems."""
+        if self.innovation is None or state.innovation is None:
+            return jnp.zeros(())
+        return jnp.asarray(self.innovation.later)[state.innovation.delay]
+
     def init(self) -> TestsState:
         """Return the state before the first measurement."""
         return TestsState(

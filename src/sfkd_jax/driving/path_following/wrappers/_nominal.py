@@ -83,14 +83,14 @@ class NominalModel(NamedTuple):
     Attributes:
         model: in path coordinates.
         conditions: where the certificate applies.
-        tube: certified bound of |e_y − ê_y| [m].
+        tube: certified bound of |e_y − ê_y| [m]; infinite if none is known.
         noise_allowance: error of a measured e_y that is added to the tube [m].
         start_error: what a start at a measurement adds to the tube [m].
     """
 
     model: Model
     conditions: Conditions
-    tube: float
+    tube: Scalar | float
     noise_allowance: float
     start_error: float
 

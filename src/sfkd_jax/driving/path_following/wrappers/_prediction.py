@@ -49,6 +49,10 @@ OUTSIDE = 0.5
 """Distance outside the box of ξ up to which the model predicts a vehicle that is not
 seen, as a share of the width of the box.
 """
+BEYOND = 3.0
+"""Largest ν of which the model says what it does, in perturbations of the data. It is
+more than 1, because a late command is that of another state.
+"""
 
 
 class PredictedStep(NamedTuple):
@@ -57,8 +61,8 @@ class PredictedStep(NamedTuple):
     Attributes:
         xi: ξ one step later.
         inside: whether the model says so: inside the conditions, and with a control
-            that differs from the linear law by no more than data and planners add to
-            it. Beyond that no model was learned.
+            that differs from the linear law hardly more than by what data and planners
+            add to it. Beyond that no model was learned.
     """
 
     xi: PathState
@@ -83,6 +87,7 @@ def periods_ahead(
     delay: CommandDelay,
     road: Float[Array, "preview 2"],
     sent: Float[Array, "step control"],
+    later: Scalar | float = 0.0,
 ) -> Periods:
     """Return the periods from an observation until the first control acts.
 
@@ -90,12 +95,13 @@ def periods_ahead(
         delay: of the commands.
         road: from the observation on.
         sent: the commands that may still act, newest last.
+        later: periods by which the commands act later than stated.
     """
-    count = ceil(delay.first)
+    count = ceil(delay.first + delay.tolerance)
     # A control that acts before the first one is held: its next command is not known.
-    controls = [delay.acting(sent, sent[-1], period) for period in range(count)]
-    share = np.clip(delay.first - np.arange(count), 0.0, 1.0)
-    return Periods(road[:count], jnp.stack(controls), jnp.asarray(share, dtype=float))
+    controls = [delay.acting(sent, sent[-1], period, later) for period in range(count)]
+    share = jnp.clip(delay.first + later - jnp.arange(count), 0.0, 1.0)
+    return Periods(road[:count], jnp.stack(controls), share)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +170,7 @@ class Prediction:
             return PredictedStep(coasting, jnp.asarray(False))
         after = expected_coordinates(self.model, fiber, xi, nu, road)
         finite = all_finite(after)
-        usual = jnp.all(jnp.abs(nu) <= 1.01 * self.law.perturbation)
+        usual = jnp.all(jnp.abs(nu) <= BEYOND * self.law.perturbation)
         linear = turn.is_linear(xi)
         covered = self.conditions.hold(xi, road)
         inside = covered & linear & usual & finite
@@ -213,7 +219,7 @@ class Predictor(Stateful):
     Attributes:
         inner: controller along a path.
         prediction: of the closed loop.
-        delay: of the commands after an observation.
+        delay: of the commands after an observation; `Preview.later` is its error.
 
     Source: Smith (1957); Bekiaris-Liberis and Krstic (2013).
     """
@@ -238,16 +244,22 @@ class Predictor(Stateful):
         predict = self.prediction
         nearest = predict.conditions.nearest(env)
         fiber = predict.model.fiber(fold(predict.model, params), nearest)
-        periods = periods_ahead(self.delay, preview.road, preview.sent)
+        delay = self.delay
+        periods = periods_ahead(delay, preview.road, preview.sent, preview.later)
         ahead, distance = predict.ahead(fiber, nearest, xi, periods)
-        first = self.delay.first
-        reference = later(preview.reference, first, angle=YAW)
+        passing = delay.first + preview.later
+        # The preview is longer by the stated delay.
+        count = len(preview.road) - ceil(delay.first)
         rows = jnp.arange(len(preview.reference))
-        passed = jnp.interp(first, rows, lengths_along(preview.reference))
+        passed = jnp.interp(passing, rows, lengths_along(preview.reference))
         shown = preview._replace(
-            road=later(preview.road, first),
-            reference=reference,
+            road=later(preview.road, passing, count),
+            reference=later(preview.reference, passing, count, angle=YAW),
             along=preview.along + distance - passed,
         )
-        shown = shown._replace(observation=state_beside(ahead, shown))
+        beside = state_beside(ahead, shown)
+        # On time a planner in the world sees what the caller does, bit for bit.
+        shown = shown._replace(
+            observation=jnp.where(passing > 0.0, beside, preview.observation)
+        )
         return self.inner.act(params, state, ahead, env, shown)

@@ -110,6 +110,9 @@ class Shield(Stateful):
         dt: sampling period [s].
         rear: distance from the rear axle to the position of the vehicle [m], see
             `RollingCorridor`.
+        late: pairs of periods and tube [m], rising: the bounds for vehicles that are
+            later than stated by up to so many periods. Nothing is claimed of others
+            that are (NOT_CALIBRATED).
         claimed: whether `width` and `tube` are known of the vehicle itself. If they are
             known only of a model of it, nothing is claimed (NOT_CALIBRATED).
 
@@ -132,6 +135,7 @@ class Shield(Stateful):
     conditions: Conditions = ANYWHERE
     dt: Positive = 0.1
     rear: NonNegative = 0.0
+    late: tuple[tuple[float, float], ...] = ()
     claimed: bool = True
 
     def __post_init__(self) -> None:
@@ -152,7 +156,9 @@ class Shield(Stateful):
         environments = len(self.law.low) - 2
         return ShieldState(
             inner=self.inner.init(key),
-            latent=self._nominal.zeros(key, self.law.gain.shape[-1], environments),
+            latent=self._nominal(self.tube).zeros(
+                key, self.law.gain.shape[-1], environments
+            ),
             started=jnp.asarray(False),
             env=jnp.full(environments, jnp.nan, dtype=float),
             offset=jnp.zeros(()),
@@ -169,10 +175,11 @@ class Shield(Stateful):
     ) -> tuple[Control, ShieldState, ControllerInfo]:
         """Take one control step."""
         planned, inner, info = self.inner.act(params, state.inner, xi, env, preview)
+        tube = self._tube(preview.later)
         road = self._road(preview)
         turn = self.law.turn(road[0, 0], road[0, 1], self.conditions.nearest(env))
         law_control = turn.feedback(xi)
-        compared = self._nominal.compare(
+        compared = self._nominal(tube).compare(
             params, state._replace(inner=inner), xi, env, preview, turn
         )
         info = reported(info)
@@ -181,11 +188,11 @@ class Shield(Stateful):
         )
         now = compared.state
         reason = self._reason(compared, decision, preview)
-        claim = self._claim(reason, now, xi, preview)
+        claim = self._claim(reason, now, xi, preview, tube)
         passed = decision.passed
         removed = jnp.where(compared.outside_box, 1.0, 1.0 - passed.scale)
         rolls = claim.reason == Reason.ROLLING
-        added = claim.bound - self.width - self.tube
+        added = claim.bound - self.width - tube
         info = info._replace(
             plan=info.plan._replace(healthy=decision.usable),
             claim=claim,
@@ -213,13 +220,23 @@ class Shield(Stateful):
         )
         return decision.control, after, info
 
-    @property
-    def _nominal(self) -> NominalModel:
-        """The model that the shield keeps in its corridor."""
+    def _tube(self, later: Scalar) -> Scalar:
+        """Return the bound for a vehicle that is later by some periods [m].
+
+        It is infinite if none is known.
+        """
+        tube = jnp.full_like(later, jnp.inf)
+        for periods, bound in reversed(self.late):
+            tube = jnp.where(later <= periods, bound, tube)
+        tube = jnp.where(later == 0.0, self.tube, tube)
+        return jnp.where(later < 0.0, jnp.inf, tube)
+
+    def _nominal(self, tube: Scalar | float) -> NominalModel:
+        """Return the model that the shield keeps in its corridor."""
         return NominalModel(
             model=self.model,
             conditions=self.conditions,
-            tube=self.tube,
+            tube=tube,
             noise_allowance=self.noise_allowance,
             start_error=self.start_error,
         )
@@ -290,6 +307,7 @@ class Shield(Stateful):
         before: ShieldState,
         xi: PathState,
         preview: Preview,
+        tube: Scalar,
     ) -> Claim:
         """Return what is claimed of this step.
 
@@ -298,13 +316,14 @@ class Shield(Stateful):
             before: the nominal model at this step.
             xi: measured ξ.
             preview: of the road.
+            tube: of a vehicle that is so late [m].
         """
+        known = jnp.isfinite(tube) & self.claimed
+        reason = first(reason, (~known, Reason.NOT_CALIBRATED))
         holds = reason == Reason.CERTIFIED
-        if not self.claimed:
-            return Claim(reason=jnp.where(holds, Reason.NOT_CALIBRATED, reason))
-        certified = self.width + self.tube + before.offset
+        certified = self.width + tube + before.offset
         measured = (preview.reason == Reason.CERTIFIED) & jnp.all(preview.measured)
-        slow = self._rolling.applies(xi, self._road(preview)[0])
+        slow = self._rolling.applies(xi, self._road(preview)[0]) & known
         rolls = slow & measured & ~holds & jnp.isfinite(before.rolling)
         bound = jnp.where(holds, certified, jnp.nan)
         return Claim(
