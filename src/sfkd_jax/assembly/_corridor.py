@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from sfkd_jax.driving import path_following, plants
-from sfkd_jax.driving.certificate import Corridor, DrivingCertificate
+from sfkd_jax.driving.certificate import (
+    Corridor,
+    DrivingCertificate,
+    LateCorridor,
+)
 from sfkd_jax.driving.path_coordinates import HEADING, LATERAL
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.types import Controller, Model
@@ -100,23 +104,48 @@ def _tubes(
 
     Returns:
         Pairs of periods and tube [m], rising. A tube holds for vehicles that are later
-        by up to so many periods. It is empty if the corridor is of another latency.
+        by up to so many periods, of whatever. It is empty if the corridor is of another
+        latency.
     """
     sizes = (len(plant.states), len(plant.controls))
-    stated = latency.sized(*sizes).loop(plant.dt).periods
-    calibrated = corridor.conditions.latency.sized(*sizes).loop(plant.dt).periods
-    gaps = [mine - theirs for mine, theirs in zip(stated, calibrated, strict=True)]
+    stated = latency.sized(*sizes)
+    calibrated = corridor.conditions.latency.sized(*sizes)
+    gaps = [
+        mine - theirs
+        for mine, theirs in zip(
+            stated.loop(plant.dt).periods,
+            calibrated.loop(plant.dt).periods,
+            strict=True,
+        )
+    ]
     # A corridor says nothing about vehicles that are less late.
     if min(gaps) < 0.0:
         return ()
-    tubes = [(0.0, corridor.bounds.vehicle_to_nominal_position)]
-    for late in corridor.late:
-        # The shield keeps the nominal corridor of the conditions, whatever is late.
-        tube = late.corridor_m - corridor.bounds.nominal
-        tubes.append((round(late.later_s / plant.dt, 9), tube))
-    return tuple(
-        (periods - max(gaps), tube) for periods, tube in tubes if periods >= max(gaps)
-    )
+    longest = max(gaps)
+    on_time = {0.0: corridor.bounds.vehicle_to_nominal_position}
+    tubes = on_time | _late_tubes(corridor.late_controls, corridor, plant.dt)
+    known = {periods: tube for periods, tube in tubes.items() if periods >= longest}
+    if stated.controls == calibrated.controls:
+        # Nothing but the sensors is later, so e is known in time.
+        tubes = on_time | _late_tubes(corridor.late_sensors, corridor, plant.dt)
+        enough = [tube for periods, tube in tubes.items() if periods >= longest]
+        if enough:
+            known[longest] = enough[0]
+    pairs = sorted(known.items())
+    return tuple((periods - longest, tube) for periods, tube in pairs)
+
+
+def _late_tubes(
+    rows: Sequence[LateCorridor], corridor: Corridor, dt: float
+) -> dict[float, float]:
+    """Return the tubes of late vehicles [m] by how many periods they are later.
+
+    The shield keeps the nominal corridor of the conditions, whatever is late.
+    """
+    return {
+        round(row.later_s / dt, 9): row.corridor_m - corridor.bounds.nominal
+        for row in rows
+    }
 
 
 def measurement_tests(

@@ -133,9 +133,9 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     assert corridor.conditions.acceleration == 2.0
     assert again.corridor.conditions.latency == late.sized(4, 2)
     assert len(again.corridor.margins.delay_s) == len(again.corridor.margins.speed)
-    (later,) = again.corridor.late
-    assert later.later_s == 0.1
-    assert later.corridor_m > corridor.bounds.nominal
+    for (later,) in (again.corridor.late_sensors, again.corridor.late_controls):
+        assert later.later_s == 0.1
+        assert later.corridor_m > later.bounds.nominal
     groups = corridor.by_group
     assert list(groups) == ["bends", "speeds", "lane_changes"]
     # The claim is that of the worst group.

@@ -483,7 +483,7 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
         nominal=0.09, vehicle_to_nominal_position=0.11, vehicle_to_nominal_yaw=0.0
     )
     row = LateCorridor(later_s=0.2, bounds=wider, coverage=corridor.coverage)
-    late = replace(corridor, late=(row,))
+    late = replace(corridor, late_controls=(row,))
     build_with(late)
     assert made["tube"] == 0.06
     assert made["late"] == ((0.0, 0.06), (2.0, pytest.approx(0.12)))
@@ -493,6 +493,14 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     assert made["late"] == ((pytest.approx(0.5), pytest.approx(0.12)),)
     build_with(late, latency=Latency((0.3,)))
     assert not made["claimed"]
+    # Where only the sensors are later, e is known in time.
+    bounds = replace(wider, vehicle_to_nominal_position=0.08)
+    late = replace(late, late_sensors=(replace(row, bounds=bounds),))
+    build_with(late, latency=Latency((0.2,)))
+    assert made["tube"] == pytest.approx(0.09)
+    assert made["late"] == ((0.0, pytest.approx(0.09)),)
+    build_with(late, latency=Latency((), (0.2,)))
+    assert made["tube"] == pytest.approx(0.12)
     # Measured on a model of logs, it claims nothing of the car before its own runs do.
     identified = replace(corridor.conditions, identified_from="contents")
     corridor = replace(corridor, conditions=identified)

@@ -223,9 +223,8 @@ class LateCorridor:
     The controller compensates its latency. No attack is made on this corridor.
 
     Attributes:
-        later_s: delay in addition to the latency of the conditions, of all sensors or
-            of all controls [s].
-        bounds: of the worse of both.
+        later_s: delay in addition to the latency of the conditions [s].
+        bounds: of the worst group.
         coverage: of the worst group.
     """
 
@@ -260,7 +259,9 @@ class Corridor:
         seconds: that the measurements took [s].
         recorded: corridor of recorded runs of the car, or None.
         margins: of the law; None in certificates from before they were measured.
-        late: of vehicles that are later, by rising delays.
+        late_sensors: of vehicles whose sensors are all later, by rising delays.
+        late_controls: of vehicles whose controls are all later. They know e before
+            their commands act as well.
     """
 
     conditions: Conditions
@@ -279,7 +280,8 @@ class Corridor:
     seconds: NonNegative
     recorded: Recorded | None = None
     margins: LawMargins | None = field(default=None, metadata=ADDED)
-    late: tuple[LateCorridor, ...] = field(default=(), metadata=ADDED)
+    late_sensors: tuple[LateCorridor, ...] = field(default=(), metadata=ADDED)
+    late_controls: tuple[LateCorridor, ...] = field(default=(), metadata=ADDED)
 
     @property
     def is_claimed(self) -> bool:
@@ -300,5 +302,6 @@ class Corridor:
             bounds=replace(self.bounds, **vars(recorded.bounds)),
             corridor_m=recorded.corridor_m,
             level=recorded.level,
-            late=(),
+            late_sensors=(),
+            late_controls=(),
         )

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
 
-from sfkd_jax.certificate import OutputMetric
+from sfkd_jax.certificate import Coverage, OutputMetric
 from sfkd_jax.certification import (
     conformal_bounds,
     rows,
@@ -54,7 +55,7 @@ from sfkd_jax.driving.corridor._runs import (
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.driving.drives import Reading
 from sfkd_jax.driving.scenarios import DRIVES
-from sfkd_jax.latency import Delays, Latency
+from sfkd_jax.latency import Delays
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.types import Key
 
@@ -119,9 +120,8 @@ def measure_corridor(
         measure_runs(loop, claims, simulate, driver(run_key)[0], key)
         for driver, run_key, key in zip(drivers, run_keys, sensor_keys, strict=True)
     )
-    bounds, groups = _bounds_of_groups(
-        units.scores, calibration.scores, test.scores, level
-    )
+    scores = [part.scores for part in (units, calibration, test)]
+    bounds, groups = _bounds_of_groups(scores, level)
     tube = bounds.vehicle_to_nominal_position
     # The shortest dwell: an attack switches as often as the conditions allow.
     dwell_steps = max(1, round(dwell[0] / loop.plant.dt))
@@ -130,18 +130,14 @@ def measure_corridor(
     observers = (partial(observe, drive), partial(observe, drive_s3))
     alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
     settings = data, runs, duration, dwell
-    late = [
-        _late_corridor(loop, delay, claims, level, settings, stream(LATE_STREAM))
-        for delay in later
-    ]
-    coverages = [group.coverage for group in groups.values()]
+    late = partial(_late_corridors, loop, later, claims, level, settings)
     return Corridor(
         conditions=_conditions(loop, data, duration, dwell, identified_from),
         level=level,
         runs=runs,
         bounds=bounds,
         corridor_m=bounds.nominal + tube,
-        coverage=min(coverages, key=lambda coverage: coverage.share),
+        coverage=_coverage_of_worst(groups),
         by_group=groups,
         # Reported beside the claim and no part of it, since S3 does not meet the
         # conditions.
@@ -152,60 +148,59 @@ def measure_corridor(
         failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
         shield_horizon=horizon,
         margins=law_margins(loop, data),
-        late=tuple(late),
+        late_sensors=late("sensors", stream(LATE_STREAM)),
+        late_controls=late("controls", stream(LATE_STREAM)),
         seconds=time.perf_counter() - began,
     )
 
 
-def _late_corridor(
+def _late_corridors(
     loop: Loop,
-    delay: float,
+    delays: Delays,
     claims: Mapping[str, OutputMetric],
     level: float,
     settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
+    late: Literal["sensors", "controls"],
     key: Key,
-) -> LateCorridor:
-    """Return the corridor of a loop that is later, and compensates it.
-
-    The worse of two loops counts: all sensors are later, or all controls.
+) -> tuple[LateCorridor, ...]:
+    """Return the corridors of a loop that is later, and compensates it.
 
     Args:
         loop: of the policy.
-        delay: in addition to the latency of the loop [s].
+        delays: in addition to the latency of the loop [s].
         claims: proved metrics by the names of the outputs.
         level: 1 − δ.
         settings: of the drivers, see `drivers_of`.
-        key: consumed.
+        late: what is later.
+        key: used anew for every delay, so that all meet the same roads; consumed.
     """
-    sensors = tuple(delay + one for one in loop.latency.sensors)
-    controls = tuple(delay + one for one in loop.latency.controls)
-    latencies = (
-        Latency(sensors, loop.latency.controls),
-        Latency(loop.latency.sensors, controls),
-    )
     corridors = []
-    for latency in latencies:
-        later = loop._replace(latency=latency)
+    for delay in sorted(delays):
+        longer = tuple(delay + one for one in getattr(loop.latency, late))
+        later = loop._replace(latency=replace(loop.latency, **{late: longer}))
         driver, _ = drivers_of(later, *settings)
         simulate = jax.jit(partial(simulate_nominal, later))
         scores = []
         for part in range(3):
             run_key, sensor_key = jax.random.split(jax.random.fold_in(key, part))
             runs, _ = driver(run_key)
-            scores.append(
-                measure_runs(later, claims, simulate, runs, sensor_key).scores
-            )
-        units, calibration, test = scores
-        bounds, groups = _bounds_of_groups(units, calibration, test, level)
-        coverages = [group.coverage for group in groups.values()]
+            measured = measure_runs(later, claims, simulate, runs, sensor_key)
+            scores.append(measured.scores)
+        bounds, groups = _bounds_of_groups(scores, level)
         corridors.append(
             LateCorridor(
                 later_s=delay,
                 bounds=JointBounds(**{name: getattr(bounds, name) for name in JOINT}),
-                coverage=min(coverages, key=lambda coverage: coverage.share),
+                coverage=_coverage_of_worst(groups),
             )
         )
-    return max(corridors, key=lambda corridor: corridor.corridor_m)
+    return tuple(corridors)
+
+
+def _coverage_of_worst(groups: Mapping[str, GroupBounds]) -> Coverage:
+    """Return the coverage of the group whose runs leave the bounds most often."""
+    coverages = [group.coverage for group in groups.values()]
+    return min(coverages, key=lambda coverage: coverage.share)
 
 
 def _conditions(
@@ -267,29 +262,26 @@ def calibrate_on_runs(
 
 
 def _bounds_of_groups(
-    units: np.ndarray,
-    calibration: np.ndarray,
-    test: np.ndarray,
-    level: float,
+    scores: list[np.ndarray], level: float
 ) -> tuple[Bounds, dict[str, GroupBounds]]:
     """Return the bounds of the worst group, and bounds and coverage of every group.
 
     Args:
-        units: scores of the runs that fix the units, group after group.
-        calibration: of those that set the bounds.
-        test: of those on which the coverage is counted.
+        scores: of the runs that fix the units, of those that set the bounds, and of
+            those on which the coverage is counted; each group after group.
         level: 1 − δ.
     """
+    units, calibration, test = scores
     units_of_groups = np.split(units, len(DRIVES))
     calibration_of_groups = np.split(calibration, len(DRIVES))
     test_of_groups = np.split(test, len(DRIVES))
     bounds_of_groups = {}
-    for name, unit_scores, scores in zip(
+    for name, unit_scores, run_scores in zip(
         DRIVES, units_of_groups, calibration_of_groups, strict=True
     ):
         # Runs in which a simulator failed fix no units.
         finite = unit_scores[np.isfinite(unit_scores[:, 0])]
-        bounds_of_groups[name] = calibrate_corridor(finite, scores, level=level)
+        bounds_of_groups[name] = calibrate_corridor(finite, run_scores, level=level)
     worst = {
         name: max(getattr(bounds, name) for bounds in bounds_of_groups.values())
         for name in (*JOINT, *ALONE)
@@ -297,9 +289,10 @@ def _bounds_of_groups(
     bounds = Bounds(**worst)
     groups = {
         name: GroupBounds(
-            bounds=bounds_of_groups[name], coverage=corridor_coverage(bounds, scores)
+            bounds=bounds_of_groups[name],
+            coverage=corridor_coverage(bounds, run_scores),
         )
-        for name, scores in zip(DRIVES, test_of_groups, strict=True)
+        for name, run_scores in zip(DRIVES, test_of_groups, strict=True)
     }
     return bounds, groups
 

@@ -50,11 +50,11 @@ def _require_what_follows(corridor: Corridor) -> None:
             "corridor.corridor_m does not follow from its bounds",
         )
 
-    delays = [row.later_s for row in corridor.late]
-    require(
-        all(before < after for before, after in pairwise(delays)),
-        "the delays of corridor.late do not rise",
-    )
+    for rows in (corridor.late_sensors, corridor.late_controls):
+        require(
+            all(one.later_s < next.later_s for one, next in pairwise(rows)),
+            "the delays of the late corridors do not rise",
+        )
 
 
 def _require_sizes(corridor: Corridor, trained: Trained) -> None:

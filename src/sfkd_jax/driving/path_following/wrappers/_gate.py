@@ -209,19 +209,14 @@ class Gate(Stateful):
             jnp.all(measured) & preview.on_time,
         )
         later = self.tests.later(tests)
-        # What follows is about another loop.
-        changed = later != self.tests.later(state.tests)
-        doubt = jnp.where(
-            changed, round(SETTLING / self.prediction.dt), believed.state.doubt
-        )
+        doubt = self._doubt(believed, later != self.tests.later(state.tests))
         reason = first(
             inputs.reason,
             (~jnp.all(measured), Reason.NOT_MEASURED),
             (alarm, Reason.ALARM),
             (doubt > 0, Reason.TRIAL),
         )
-        road = road_from(preview, believed.along)
-        road = self._slowed(road, believed.xi[PATH_SPEED], believed.lost)
+        road = self._road(preview, believed)
         shown = preview._replace(
             road=road,
             along=believed.along,
@@ -237,16 +232,11 @@ class Gate(Stateful):
             params, inputs, believed, shown, control, info, tests.innovation
         )
         innovation = difference(inputs.xi, state.expected)
+        innovation = jnp.where(measured, innovation, jnp.nan)
         info = info._replace(
             claim=info.claim.under(reason),
             env_inside=info.env_inside & inputs.env_known,
-            gate=GateInfo(
-                measured=measured,
-                innovation=jnp.where(measured, innovation, jnp.nan),
-                statistic=statistic,
-                alarm=alarm,
-                later=later,
-            ),
+            gate=GateInfo(measured, innovation, statistic, alarm, later),
         )
         after = believed.state._replace(
             inner=inner,
@@ -259,6 +249,17 @@ class Gate(Stateful):
             tests=tests._replace(innovation=expected.test),
         )
         return control, after, info
+
+    def _doubt(self, believed: Believed, changed: Bool[Array, ""]) -> Int[Array, ""]:
+        """Return the number of steps until the certificate may be claimed again.
+
+        Args:
+            believed: of the measurement.
+            changed: whether another latency was found: what follows is another loop.
+        """
+        settling = round(SETTLING / self.prediction.dt)
+        longer = jnp.maximum(believed.state.doubt, settling)
+        return jnp.where(changed, longer, believed.state.doubt)
 
     @property
     def _plausibility(self) -> Plausibility:
@@ -273,15 +274,16 @@ class Gate(Stateful):
             growth=self.growth,
         )
 
-    def _slowed(
-        self, road: Float[Array, "preview 2"], speed: Scalar, lost: Bool[Array, ""]
-    ) -> Float[Array, "preview 2"]:
-        """Return the road; of a lost vehicle, with speeds at which it brakes and stops.
+    def _road(self, preview: Preview, believed: Believed) -> Float[Array, "preview 2"]:
+        """Return κ and v_ref from the believed place on.
 
-        There is then nothing to believe and nothing to rely on.
+        Of a lost vehicle it has speeds at which it brakes and stops. There is then
+        nothing to believe and nothing to rely on.
         """
-        slower = jnp.minimum(road[:, 1], jnp.maximum(speed - SLOWING, 0.0))
-        return jnp.stack([road[:, 0], jnp.where(lost, slower, road[:, 1])], axis=1)
+        road = road_from(preview, believed.along)
+        slowing = jnp.maximum(believed.xi[PATH_SPEED] - SLOWING, 0.0)
+        slower = jnp.where(believed.lost, jnp.minimum(road[:, 1], slowing), road[:, 1])
+        return jnp.stack([road[:, 0], slower], axis=1)
 
     def _replaced(
         self,

@@ -256,6 +256,8 @@ class Predictor(Stateful):
             road=later(preview.road, passing, count),
             reference=later(preview.reference, passing, count, angle=YAW),
             along=preview.along + distance - passed,
+            # Inside nothing is on its way.
+            sent=preview.sent[:0],
         )
         beside = state_beside(ahead, shown)
         # On time a planner in the world sees what the caller does, bit for bit.
