@@ -38,6 +38,15 @@ class Case(NamedTuple):
         return Latency((self.sensors,), (self.controls,))
 
     @property
+    def later(self):
+        """By how much the loop is later than assumed [s]."""
+        true, assumed = (
+            sum((*latency.sensors, *latency.controls))
+            for latency in (self.true, self.assumed)
+        )
+        return true - assumed
+
+    @property
     def assumed(self):
         """The latency that the controller compensates."""
         sensors = self.assumed_sensors
@@ -53,7 +62,10 @@ CASES = {
     **{f"sensors {late} s": Case(late, 0.0) for late in (0.1, 0.2, 0.3)},
     **{f"controls {late} s": Case(0.0, late) for late in (0.1, 0.2, 0.3)},
     **{f"half each, {late} s": Case(late / 2, late / 2) for late in (0.1, 0.2, 0.3)},
-    "0.1 s, nothing assumed": Case(0.1, 0.0, 0.0, 0.0),
+    "sensors 0.1 s, nothing assumed": Case(0.1, 0.0, 0.0, 0.0),
+    "controls 0.1 s, nothing assumed": Case(0.0, 0.1, 0.0, 0.0),
+    "sensors 0.2 s, nothing assumed": Case(0.2, 0.0, 0.0, 0.0),
+    "controls 0.2 s, nothing assumed": Case(0.0, 0.2, 0.0, 0.0),
     "on time, 0.1 s assumed": Case(0.0, 0.0, 0.1, 0.0),
     "0.2 s, 0.1 s assumed": Case(0.2, 0.0, 0.1, 0.0),
     "0.1 s, 0.2 s assumed": Case(0.1, 0.0, 0.2, 0.0),
@@ -81,7 +93,7 @@ def drive(path, case, options):
         driver.params,
         horizon=driver.interface["horizon"],
         latency=case.true,
-        record={"claim": lambda info: info.claim},
+        record={"claim": lambda info: info.claim, "gate": lambda info: info.gate},
     )
     keys = jax.random.split(drive_key, options.episodes)
     driven = jax.jit(jax.vmap(episode))(scenes, keys)
@@ -89,12 +101,21 @@ def drive(path, case, options):
     claim = jax.tree.map(np.asarray, driven.signals["claim"])
     largest = lateral.max(axis=1)
     claimed = claim.reason == Reason.CERTIFIED
+    gate = jax.tree.map(np.asarray, driven.signals["gate"])
+    off = np.abs(gate.later * car.dt - case.later)
+    # Time of a run for which the estimate is off by more than half a period.
+    wrong = car.dt * np.sum(off > 0.5 * car.dt + 1e-6, axis=1)
+    bounds = claim.bound[claimed]
     return {
         "departures": int(np.sum(~(largest <= DEPARTED))),
         "largest_m": round(float(largest.max()), 3),
         "rmse_mm": round(float(np.mean(rmse_mm(lateral[:, SETTLED:]))), 2),
         "claimed": round(float(claimed.mean()), 4),
         "beyond_claim": int(np.sum(claimed & (lateral > claim.bound))),
+        "bound_m": round(float(np.median(bounds)), 3) if bounds.size else None,
+        "wrong_latency_s": round(float(np.median(wrong)), 1),
+        "wrong_latency_longest_s": round(float(wrong.max()), 1),
+        "runs_with_alarm": int(np.sum(gate.alarm.any(axis=1))),
     }
 
 

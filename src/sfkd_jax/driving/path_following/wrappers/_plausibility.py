@@ -165,16 +165,19 @@ class Plausibility:
         earlier = self._earlier(state, observed, preview.road[0, 0], gap)
         late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
         late &= preview.on_time & shifted
-        # Not for ever: the vehicle may have slid, and has stopped by then.
+        # Not for ever: the vehicle may have slid, and has stopped by then. Nor before
+        # it is known where the vehicle was: the first positions may have been old ones.
         longest = round(PATIENCE_AHEAD / self.dt)
-        usable = seen & ~(late | (shifted & (jnp.max(state.missing) < longest)))
+        refused = shifted & all_finite(state.past)
+        usable = seen & ~(late | (refused & (jnp.max(state.missing) < longest)))
 
         longest = jnp.where(late, longest, round(self.patience / self.dt))
         overdue = _overdue(state.missing >= longest, plausible)
         measured = usable & (plausible | overdue | ~compared)
         # Either this measurement or all that was believed before is wrong, and nothing
         # says which.
-        forced = compared & jnp.any(measured & ~(jnp.abs(innovation) <= limit))
+        unexplained = ~(jnp.abs(innovation) <= limit) | shifted
+        forced = compared & jnp.any(measured & unexplained)
         missing = jnp.where(measured, 0, state.missing + 1)
 
         xi = jnp.where(measured, observed, expected)
