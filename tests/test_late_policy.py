@@ -1,4 +1,4 @@
-"""A shipped policy on a car with latency: it drives, says so, and claims nothing."""
+"""A shipped policy on a car with latency: it drives, says so, and claims what holds."""
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,8 @@ def late():
     return sfkd_jax.load("kinematic_path", latency=LATENCY)
 
 
-def episode(policy, seconds=15.0):
-    """On S3, whose friction and wind switch every 3 s."""
+def episode(policy, latency, seconds=15.0):
+    """On S3, whose friction and wind switch every 3 s; the car has this latency."""
     family = assembly.build_scenario(
         {"name": "s3", "speed": 10.0}, policy.vehicle, duration=seconds
     )
@@ -36,20 +36,48 @@ def episode(policy, seconds=15.0):
             dt=policy.vehicle.dt,
             horizon=policy.interface["horizon"],
             observation_noise=policy.vehicle.sensor_noise,
-            latency=LATENCY,
-            record={"claim": lambda info: info.claim},
+            latency=latency,
+            record={"claim": lambda info: info.claim, "gate": lambda info: info.gate},
         )
     )
     return jax.tree.map(np.asarray, drive(jax.random.key(4)))
 
 
-def test_it_follows_its_path_and_claims_nothing(late):
-    """The corridor that ships is that of a car without latency."""
-    driven = episode(late)
-    assert np.abs(driven.lateral).max() < 0.29
+def test_it_follows_its_path_and_claims_the_corridor_of_its_latency(late):
+    driven = episode(late, LATENCY)
+    distance = np.abs(driven.lateral)
     claim = driven.signals["claim"]
-    assert np.isnan(claim.bound).all()
-    assert set(claim.reason.tolist()) == {sfkd_jax.Reason.NOT_CALIBRATED}
+    assert (claim.reason == sfkd_jax.Reason.CERTIFIED).mean() > 0.95
+    assert (distance <= claim.bound)[np.isfinite(claim.bound)].all()
+    (row, *_) = late.certificate.corridor.late_controls
+    np.testing.assert_allclose(claim.bound[-1], row.corridor_m, rtol=1e-3)
+    assert (driven.signals["gate"].later == 0.0).all()
+
+
+def test_a_latency_that_nobody_stated_is_found_and_compensated():
+    on_time = sfkd_jax.load("kinematic_path")
+    driven = episode(on_time, sfkd_jax.Latency((), (0.2,)))
+    later = driven.signals["gate"].later
+    claim = driven.signals["claim"]
+    assert (later[100:] == 2.0).all()
+    assert np.abs(driven.lateral).max() < 0.5
+    # The claim ends, and comes back as that of this latency.
+    (_, row, _) = on_time.certificate.corridor.late_controls
+    assert claim.bound[0] < row.corridor_m
+    assert np.isnan(claim.bound[(later[1:] != later[:-1]).nonzero()[0] + 1]).all()
+    np.testing.assert_allclose(claim.bound[-1], row.corridor_m, rtol=1e-3)
+
+
+def test_of_a_latency_that_no_corridor_covers_nothing_is_claimed():
+    later = sfkd_jax.load("kinematic_path", latency=sfkd_jax.Latency((0.5,)))
+    state = later.controller.init(jax.random.key(0))
+    points = jnp.stack(
+        [jnp.arange(1.0, 26.0), *[jnp.zeros(25)] * 2, jnp.full(25, 10.0)]
+    )
+    seen = jnp.asarray([0.0, 0.0, 0.0, 10.0])
+    env = jnp.asarray([0.5, 0.0])
+    _, _, info = later.controller.act(later.params, state, seen, env, points.T)
+    assert info.claim.reason == sfkd_jax.Reason.NOT_CALIBRATED
     assert "latency" in sfkd_jax.Reason.NOT_CALIBRATED.advice
 
 

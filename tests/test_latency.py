@@ -34,8 +34,8 @@ def test_the_acting_command_is_the_mean_of_what_acts(periods, period):
 
 @pytest.mark.parametrize("periods", [(0.0, 0.0), (1.0, 1.0), (0.3, 2.45)])
 def test_of_a_delay_that_may_be_wrong_every_hypothesis_is_another_delay(periods):
-    delay = CommandDelay(periods, tolerance=1.5)
-    assert delay.hypotheses[-1] == 1.5
+    delay = CommandDelay(periods, tolerance=2.0)
+    assert delay.hypotheses[-1] == 2.0
     assert 0.0 in delay.hypotheses
     assert min(delay.hypotheses) + delay.first >= 0.0
     random = np.random.default_rng(0)

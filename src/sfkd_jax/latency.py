@@ -7,7 +7,7 @@ command that acts from k + d_u on, for one sampling period. Delays are constant.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, floor
 from typing import Annotated, TypeAlias
 
 import jax.numpy as jnp
@@ -127,12 +127,13 @@ class CommandDelay:
 
     @property
     def hypotheses(self) -> tuple[float, ...]:
-        """By how many periods the commands may act later than stated, in halves.
+        """By how many whole periods the commands may act later than stated.
 
-        They never act before they are sent.
+        Half a period is within the margin of a law, and is hard to see. Commands never
+        act before they are sent.
         """
-        halves = round(2.0 * self.tolerance)
-        later = (0.5 * half for half in range(-halves, halves + 1))
+        whole = floor(self.tolerance)
+        later = map(float, range(-whole, whole + 1))
         return tuple(one for one in later if one >= -self.first)
 
     def acting(

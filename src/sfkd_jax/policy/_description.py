@@ -6,7 +6,12 @@ from collections.abc import Iterator
 from typing import Any
 
 from sfkd_jax import assembly
-from sfkd_jax.driving.certificate import Conditions, DrivingCertificate, LawMargins
+from sfkd_jax.driving.certificate import (
+    Conditions,
+    Corridor,
+    DrivingCertificate,
+    LawMargins,
+)
 from sfkd_jax.driving.plants import axes
 from sfkd_jax.latency import Latency
 from sfkd_jax.policy._trained import TrainedModel
@@ -128,6 +133,8 @@ def _certified_facts(
     yield _corridor_conditions(corridor.conditions, env_names)
     if corridor.margins:
         yield _margins_in_words(corridor.margins)
+    if corridor.late_sensors or corridor.late_controls:
+        yield _late_in_words(corridor)
     if recorded := corridor.recorded:
         number = recorded.conditions.runs
         width = f"{recorded.corridor_m:.3f} m"
@@ -144,6 +151,16 @@ def _margins_in_words(margins: LawMargins) -> str:
         f"law, on a grid: stable up to {delay:.2f} s later (at {at:.3g} m/s), with "
         f"{max(margins.gain_low):.2g} to {min(margins.gain_high):.2g} times its gains"
     )
+
+
+def _late_in_words(corridor: Corridor) -> str:
+    """Return the line about the corridors of vehicles that are later."""
+    parts = []
+    kinds = {"sensors": corridor.late_sensors, "controls": corridor.late_controls}
+    for late, rows in kinds.items():
+        widths = [f"{row.later_s:g} s {row.corridor_m:.3f} m" for row in rows]
+        parts.append(f"{late} {', '.join(widths)}")
+    return f"corridor if later: {'; '.join(parts)}"
 
 
 def _corridor_conditions(conditions: Conditions, env_names: list[str]) -> str:
