@@ -568,6 +568,38 @@ def latency():
     )
 
 
+def latency_claims():
+    """What is claimed on S3 with latency, and how long it takes to find it."""
+    return by_case(
+        "latency",
+        {
+            "claimed [%]": lambda row, _: f"{100 * row['claimed']:.0f}",
+            "steps beyond a claim": lambda row, _: f"{row['beyond_claim']}",
+            "with a wrong latency [s]": lambda row, _: f"{row['wrong_latency_s']:.1f}",
+        },
+    )
+
+
+def late_corridors():
+    """The corridors of the policies that ship on vehicles that are later."""
+    found = [(corridor, old) for corridor, _, old in shipped()]
+    lines = []
+    for late in ("sensors", "controls"):
+        of_cars = [getattr(corridor, f"late_{late}") for corridor, _ in found]
+        for rows in zip(*of_cars, strict=True):
+            line = [f"{late} {rows[0].later_s:g} s later"]
+            for row, (corridor, old) in zip(rows, found, strict=True):
+                ratio = row.corridor_m / corridor.corridor_m
+                kept = 100 * row.coverage.share
+                texts = (f"{row.corridor_m:.3f}", f"{ratio:.2f}", f"{kept:.1f}")
+                line += [Measured(text, old) for text in texts]
+            lines.append(line)
+    heads = ("corridor [m]", "over that on time", "coverage [%]")
+    return table(
+        ["what is late", *(f"{car}: {head}" for car in CARS for head in heads)], lines
+    )
+
+
 def sensors():
     """What wrong sensors and other references do, on S3."""
     return by_case(
@@ -653,7 +685,9 @@ BLOCKS = {
     "docs/adaptation.md": {"adaptation": adaptation},
     "docs/real-car.md": {
         "margins": margins,
+        "late_corridors": late_corridors,
         "latency": latency,
+        "latency_claims": latency_claims,
         "sensors": sensors,
     },
     "docs/results.md": results.TABLES | {"peers": peers, "commonroad": foreign_cars},

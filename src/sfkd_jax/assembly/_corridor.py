@@ -162,7 +162,7 @@ def measurement_tests(
         plant: vehicle.
         estimates_env: whether e is estimated while driving. The innovations are then
             not those of the calibration, and are not tested.
-        later: delays that the test of the innovations compares.
+        later: delays of which one is estimated, see `CommandDelay.hypotheses`.
     """
     names = plant.state_names
     noise = (*corridor.conditions.sensor_noise, *(0.0 for _ in names))[: len(names)]
@@ -178,9 +178,14 @@ def measurement_tests(
         return path_following.MeasurementTests(odometry=odometry)
     calibrated = corridor.innovations
     innovation = path_following.innovation_test(
-        calibrated.levels, calibrated.deviation, calibrated.threshold, later
+        calibrated.levels, calibrated.deviation, calibrated.threshold
     )
-    return path_following.MeasurementTests(innovation, odometry)
+    delay = None
+    if len(later) > 1:
+        delay = path_following.delay_estimator(
+            calibrated.levels, calibrated.deviation, later
+        )
+    return path_following.MeasurementTests(innovation, odometry, delay)
 
 
 def _slip_of_gentle_turns(law: path_following.PathLaw) -> float:

@@ -58,6 +58,12 @@ from sfkd_jax.driving.path_following.wrappers._conditions import Box as Box
 from sfkd_jax.driving.path_following.wrappers._conditions import (
     Conditions as Conditions,
 )
+from sfkd_jax.driving.path_following.wrappers._delays import (
+    DelayEstimator as DelayEstimator,
+)
+from sfkd_jax.driving.path_following.wrappers._delays import (
+    delay_estimator as delay_estimator,
+)
 from sfkd_jax.driving.path_following.wrappers._gate import Gate as Gate
 from sfkd_jax.driving.path_following.wrappers._innovations import WINDOWS as WINDOWS
 from sfkd_jax.driving.path_following.wrappers._innovations import (

@@ -8,6 +8,7 @@ measured.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -24,11 +25,11 @@ from sfkd_jax.driving.path_following.tasks._preview import (
 )
 from sfkd_jax.driving.path_following.wrappers._estimator import input_error
 from sfkd_jax.driving.path_following.wrappers._innovations import (
-    InnovationState,
     turning_rate,
 )
 from sfkd_jax.driving.path_following.wrappers._measurement_tests import (
     MeasurementTests,
+    TestsState,
 )
 from sfkd_jax.driving.path_following.wrappers._plausibility import (
     LATEST,
@@ -94,13 +95,13 @@ class Expected(NamedTuple):
         xi: predicted ξ.
         modelled: whether the model predicted it, inside the conditions.
         place: predicted position in the world [m].
-        test: state of the test, with what the next measurement is compared with.
+        tests: state of the tests, with what the next measurement is compared with.
     """
 
     xi: PathState
     modelled: Bool[Array, ""]
     place: Float[Array, " 2"]
-    test: InnovationState | None
+    tests: TestsState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,8 +143,7 @@ class Gate(Stateful):
         horizon: number of steps of the preview.
         reads_env: whether `inner` reads the environment that it is given.
         tests: that raise alarms.
-        delay: of the commands after an observation. Which of its hypotheses holds is
-            estimated by the test of the innovations.
+        delay: of the commands after an observation; `tests` may estimate its error.
         patience: longest time on the prediction [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
@@ -228,9 +228,7 @@ class Gate(Stateful):
             params, state.inner, believed.xi, inputs.env, shown
         )
         info = reported(info)
-        expected = self._expect(
-            params, inputs, believed, shown, control, info, tests.innovation
-        )
+        expected = self._expect(params, inputs, believed, shown, control, info, tests)
         innovation = difference(inputs.xi, state.expected)
         innovation = jnp.where(measured, innovation, jnp.nan)
         info = info._replace(
@@ -246,7 +244,7 @@ class Gate(Stateful):
             doubt=jnp.maximum(doubt - 1, 0),
             env=inputs.env,
             road=road,
-            tests=tests._replace(innovation=expected.test),
+            tests=expected.tests,
         )
         return control, after, info
 
@@ -317,7 +315,7 @@ class Gate(Stateful):
         shown: Preview,
         control: Control,
         info: ControllerInfo,
-        test: InnovationState | None,
+        tests: TestsState,
     ) -> Expected:
         """Return what is expected one step later.
 
@@ -328,7 +326,7 @@ class Gate(Stateful):
             shown: to the controller.
             control: command of this step.
             info: of the controller; an estimator says in it what it estimates.
-            test: state of the test of the innovations; None without one.
+            tests: state of the tests after the measurement.
         """
         predict = self.prediction
         here = shown.road[0]
@@ -339,43 +337,56 @@ class Gate(Stateful):
             env = info.adaptation.env
             error = input_error(info.adaptation.causes, here)
 
-        def acting(later: Scalar) -> Control:
-            return self.delay.acting(shown.sent, control, later=later)
-
         nearest = predict.conditions.nearest(env)
         turn = predict.law.turn(here[0], here[1], nearest)
         fiber = None
         # A model of which nothing is known must not overrule a measurement.
         if predict.conditions.state is not None:
             fiber = predict.model.fiber(fold(predict.model, params), nearest)
-        estimate = believed.state.past[0, :-1]
-        unseen = ~believed.measured[LATERAL]
-        after = predict.step(fiber, turn, here, estimate, acting(shown.later), unseen)
-        if test is not None and self.tests.innovation is not None:
-            # From ξ as it is, under each delay that is possible.
-            xi = believed.xi
-            controls = jax.vmap(acting)(jnp.asarray(self.tests.innovation.later))
-
-            def readings(control: Control) -> tuple[Array, Bool[Array, ""]]:
-                step = predict.step(fiber, turn, here, xi, control)
-                rate = turning_rate(predict.law, xi, control, here, nearest)
-                ahead = jnp.append(step.xi, xi[HEADING] + predict.dt * rate)
-                return ahead, step.inside
-
-            ahead, inside = jax.vmap(readings)(controls + error)
-            clear = inputs.reason == Reason.CERTIFIED
-            clear = clear & jnp.all(believed.measured)
-            test = test._replace(
-                expected=jnp.where(clear, ahead, jnp.nan),
-                inside=inside,
-                level=turn.level,
-            )
+        starts, controls = self._starts(tests, believed, shown, control, error)
+        unseen = (jnp.arange(len(starts)) == 0) & ~believed.measured[LATERAL]
+        after = jax.vmap(partial(predict.step, fiber, turn, here))(
+            starts, controls, unseen
+        )
+        estimate = starts[0]
+        xi = starts[1]
+        rate = turning_rate(predict.law, xi, controls[1], here, nearest)
+        ahead = jnp.append(after.xi[1], xi[HEADING] + predict.dt * rate)
+        clear = inputs.reason == Reason.CERTIFIED
+        comparable = clear & jnp.all(believed.measured) & after.inside[1]
+        ahead = jnp.where(comparable, ahead, jnp.nan)
+        tests = self.tests.expect(tests, ahead, after.xi[2:], turn.level)
         along = believed.along + predict.progress(estimate, here)
-        place = state_beside(after.xi, shown._replace(along=along))[:2]
+        place = state_beside(after.xi[0], shown._replace(along=along))[:2]
         # In its own frame a vehicle does not move.
         moves = jnp.any(shown.observation[POSE] != 0.0)
         place = jnp.where(moves, place, jnp.nan)
-        return Expected(after.xi, after.inside, place, test)
+        return Expected(after.xi[0], after.inside[0], place, tests)
+
+    def _starts(
+        self,
+        tests: TestsState,
+        believed: Believed,
+        shown: Preview,
+        control: Control,
+        error: Control,
+    ) -> tuple[Float[Array, "start coordinate"], Float[Array, "start control"]]:
+        """Return the ξ to predict from, and what acts from there.
+
+        These are the estimate, for the next step; ξ as it is, for the test; and the
+        estimate of each observer, with the commands that it assumes.
+        """
+
+        def acting(later: Scalar | float) -> Control:
+            return self.delay.acting(shown.sent, control, later=later)
+
+        acts = acting(shown.later)
+        starts = [believed.state.past[0, :-1], believed.xi]
+        controls = [acts, acts + error]
+        if tests.delay is not None:
+            starts += list(tests.delay.estimate)
+            controls += [acting(later) + error for later in self.delay.hypotheses]
+        return jnp.stack(starts), jnp.stack(controls)
 
 
 def _elapsed(state: Any) -> Scalar:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.driving.path_coordinates import PathState
+from sfkd_jax.driving.path_following.wrappers._delays import DelayEstimator, DelayState
 from sfkd_jax.driving.path_following.wrappers._innovations import (
     InnovationState,
     InnovationTest,
@@ -24,32 +25,36 @@ class TestsState(NamedTuple):
 
     innovation: InnovationState | None
     odometry: OdometryState | None
+    delay: DelayState | None
 
 
 class MeasurementTests(NamedTuple):
-    """What raises an alarm; each test is optional.
+    """What raises an alarm, and what estimates the latency; each is optional.
 
     Attributes:
         innovation: of the vehicle against its nominal model; it takes into account what
             the controller estimates.
         odometry: of the position against the speed.
+        delay: by how much the commands act later than stated.
     """
 
     innovation: InnovationTest | None = None
     odometry: OdometryTest | None = None
-
-    def later(self, state: TestsState) -> Scalar:
-        """Return by how many periods commands act later than stated, as it seems."""
-        if self.innovation is None or state.innovation is None:
-            return jnp.zeros(())
-        return jnp.asarray(self.innovation.later)[state.innovation.delay]
+    delay: DelayEstimator | None = None
 
     def init(self) -> TestsState:
         """Return the state before the first measurement."""
         return TestsState(
             innovation=None if self.innovation is None else self.innovation.init(),
             odometry=None if self.odometry is None else self.odometry.init(),
+            delay=None if self.delay is None else self.delay.init(),
         )
+
+    def later(self, state: TestsState) -> Scalar:
+        """Return by how many periods commands act later than stated, as it seems."""
+        if self.delay is None or state.delay is None:
+            return jnp.zeros(())
+        return self.delay.delay(state.delay)
 
     def update(
         self,
@@ -70,9 +75,16 @@ class MeasurementTests(NamedTuple):
         """
         largest = jnp.asarray(jnp.nan)
         alarm = jnp.asarray(False)
+        changed = jnp.asarray(False)
+        if self.delay is not None and state.delay is not None:
+            before = self.later(state)
+            state = state._replace(delay=self.delay.update(state.delay, xi, used))
+            changed = self.later(state) != before
         if self.innovation is not None and state.innovation is not None:
+            # What it has seen until now was under another delay.
+            innovation = self.innovation.anew(state.innovation, changed)
             seen = jnp.full(xi.shape, used)
-            after, largest = self.innovation.update(state.innovation, xi, seen)
+            after, largest = self.innovation.update(innovation, xi, seen)
             state = state._replace(innovation=after)
             alarm = after.alarm
         if self.odometry is not None and state.odometry is not None:
@@ -81,3 +93,26 @@ class MeasurementTests(NamedTuple):
             largest = jnp.fmax(largest, statistic)
             alarm = alarm | moved.alarm
         return state, largest, alarm
+
+    def expect(
+        self,
+        state: TestsState,
+        readings: Float[Array, " chart"],
+        observers: Float[Array, "delay coordinate"],
+        level: Scalar,
+    ) -> TestsState:
+        """Return the state with what is expected of the next measurement.
+
+        Args:
+            state: after this measurement.
+            readings: for the test of the innovations; NaN if nothing is to be compared.
+            observers: ξ by each observer of the delay.
+            level: of the prediction, see `SteadyTurn.level`.
+        """
+        if state.innovation is not None:
+            innovation = state.innovation._replace(expected=readings, level=level)
+            state = state._replace(innovation=innovation)
+        if state.delay is not None:
+            delay = state.delay._replace(expected=observers, level=level)
+            state = state._replace(delay=delay)
+        return state

@@ -165,13 +165,10 @@ class Plausibility:
         earlier = self._earlier(state, observed, preview.road[0, 0], gap)
         late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
         late &= preview.on_time & shifted
-        # Not for ever: the vehicle may have slid, and has stopped by then. Nor before
-        # it is known where the vehicle was: the first positions may have been old ones.
-        longest = round(PATIENCE_AHEAD / self.dt)
-        refused = shifted & all_finite(state.past)
-        usable = seen & ~(late | (refused & (jnp.max(state.missing) < longest)))
+        usable = seen & ~(late | (shifted & self._refuses(state)))
 
-        longest = jnp.where(late, longest, round(self.patience / self.dt))
+        patience = jnp.where(late, PATIENCE_AHEAD, self.patience)
+        longest = jnp.round(patience / self.dt)
         overdue = _overdue(state.missing >= longest, plausible)
         measured = usable & (plausible | overdue | ~compared)
         # Either this measurement or all that was believed before is wrong, and nothing
@@ -203,6 +200,15 @@ class Plausibility:
         )
         lost = jnp.any((missing > longest) & ~usable)
         return Believed(xi, measured, along, lost, after)
+
+    def _refuses(self, state: GateState) -> Bool[Array, ""]:
+        """Return whether a position from another place of the path is refused.
+
+        It is not for ever: the vehicle may have slid, and has stopped by then. Nor is
+        it before it is known where the vehicle was: the first positions may be old.
+        """
+        longest = round(PATIENCE_AHEAD / self.dt)
+        return (jnp.max(state.missing) < longest) & all_finite(state.past)
 
     def _expected_along(self, state: GateState, preview: Preview) -> Scalar:
         """Return the expected place on the path [m]; as observed where none is."""
