@@ -105,14 +105,12 @@ def drive(path, case, options):
     off = np.abs(gate.later * car.dt - case.later)
     # Time of a run for which the estimate is off by more than half a period.
     wrong = car.dt * np.sum(off > 0.5 * car.dt + 1e-6, axis=1)
-    bounds = claim.bound[claimed]
     return {
         "departures": int(np.sum(~(largest <= DEPARTED))),
         "largest_m": round(float(largest.max()), 3),
         "rmse_mm": round(float(np.mean(rmse_mm(lateral[:, SETTLED:]))), 2),
         "claimed": round(float(claimed.mean()), 4),
         "beyond_claim": int(np.sum(claimed & (lateral > claim.bound))),
-        "bound_m": round(float(np.median(bounds)), 3) if bounds.size else None,
         "wrong_latency_s": round(float(np.median(wrong)), 1),
         "wrong_latency_longest_s": round(float(wrong.max()), 1),
         "runs_with_alarm": int(np.sum(gate.alarm.any(axis=1))),

@@ -122,12 +122,11 @@ def _tubes(
     if min(gaps) < 0.0:
         return ()
     longest = max(gaps)
-    on_time = {0.0: corridor.bounds.vehicle_to_nominal_position}
-    tubes = on_time | _late_tubes(corridor.late_controls, corridor, plant.dt)
+    tubes = _late_tubes(corridor, corridor.late_controls, plant.dt)
     known = {periods: tube for periods, tube in tubes.items() if periods >= longest}
     if stated.controls == calibrated.controls:
         # Nothing but the sensors is later, so e is known in time.
-        tubes = on_time | _late_tubes(corridor.late_sensors, corridor, plant.dt)
+        tubes = _late_tubes(corridor, corridor.late_sensors, plant.dt)
         enough = [tube for periods, tube in tubes.items() if periods >= longest]
         if enough:
             known[longest] = enough[0]
@@ -136,16 +135,24 @@ def _tubes(
 
 
 def _late_tubes(
-    rows: Sequence[LateCorridor], corridor: Corridor, dt: float
+    corridor: Corridor, rows: Sequence[LateCorridor], dt: float
 ) -> dict[float, float]:
-    """Return the tubes of late vehicles [m] by how many periods they are later.
+    """Return the tubes of vehicles [m] by how many periods they are later, rising.
 
     The shield keeps the nominal corridor of the conditions, whatever is late.
+
+    Args:
+        corridor: of vehicles on time.
+        rows: of vehicles that are later.
+        dt: sampling period [s].
     """
-    return {
-        round(row.later_s / dt, 9): row.corridor_m - corridor.bounds.nominal
-        for row in rows
-    }
+    tube = corridor.bounds.vehicle_to_nominal_position
+    tubes = {0.0: tube}
+    for row in rows:
+        # By chance the runs of a later vehicle may have stayed nearer.
+        tube = max(tube, row.corridor_m - corridor.bounds.nominal)
+        tubes[round(row.later_s / dt, 9)] = tube
+    return tubes
 
 
 def measurement_tests(

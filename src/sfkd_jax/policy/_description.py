@@ -133,7 +133,8 @@ def _certified_facts(
     yield _corridor_conditions(corridor.conditions, env_names)
     if corridor.margins:
         yield _margins_in_words(corridor.margins)
-    if corridor.late_sensors or corridor.late_controls:
+    # Of a vehicle with runs of its own, none was later.
+    if corridor.in_force().late_controls:
         yield _late_in_words(corridor)
     if recorded := corridor.recorded:
         number = recorded.conditions.runs

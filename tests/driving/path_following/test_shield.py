@@ -452,6 +452,8 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
         certificate.corridor,
         bounds=bounds,
         corridor_m=0.14,
+        late_sensors=(),
+        late_controls=(),
         conditions=replace(
             certificate.corridor.conditions, sensor_noise=(0.01, 0.01, 0.002)
         ),
@@ -501,6 +503,11 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     assert made["late"] == ((0.0, pytest.approx(0.09)),)
     build_with(late, latency=Latency((), (0.2,)))
     assert made["tube"] == pytest.approx(0.12)
+    # It is never narrower than that of a vehicle on time.
+    bounds = replace(wider, vehicle_to_nominal_position=0.0, nominal=0.0)
+    late = replace(late, late_controls=(replace(row, bounds=bounds),))
+    build_with(late, latency=Latency((), (0.2,)))
+    assert made["tube"] == 0.06
     # Measured on a model of logs, it claims nothing of the car before its own runs do.
     identified = replace(corridor.conditions, identified_from="contents")
     corridor = replace(corridor, conditions=identified)

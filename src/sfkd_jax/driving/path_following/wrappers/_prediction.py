@@ -93,7 +93,7 @@ def periods_ahead(
 
     Args:
         delay: of the commands.
-        road: from the observation on.
+        road: from the observation on; its last row stands for those after it.
         sent: the commands that may still act, newest last.
         later: periods by which the commands act later than stated.
     """
@@ -101,7 +101,8 @@ def periods_ahead(
     # A control that acts before the first one is held: its next command is not known.
     controls = [delay.acting(sent, sent[-1], period, later) for period in range(count)]
     share = jnp.clip(delay.first + later - jnp.arange(count), 0.0, 1.0)
-    return Periods(road[:count], jnp.stack(controls), share)
+    rows = np.minimum(np.arange(count), len(road) - 1)
+    return Periods(road[rows], jnp.stack(controls), share)
 
 
 @dataclass(frozen=True, kw_only=True)
