@@ -76,7 +76,8 @@ def test_of_a_latency_that_no_corridor_covers_nothing_is_claimed():
     )
     seen = jnp.asarray([0.0, 0.0, 0.0, 10.0])
     env = jnp.asarray([0.5, 0.0])
-    _, _, info = later.controller.act(later.params, state, seen, env, points.T)
+    act = jit(later.controller.act)
+    _, _, info = act(later.params, state, seen, env, points.T)
     assert info.claim.reason == sfkd_jax.Reason.NOT_CALIBRATED
     assert "latency" in sfkd_jax.Reason.NOT_CALIBRATED.advice
 
