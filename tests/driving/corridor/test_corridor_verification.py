@@ -16,6 +16,11 @@ from helpers import put
         ("corridor.bounds.nominal", -0.1, "nominal = -0.1 is not in [0, inf)"),
         ("corridor.conditions.dwell_s", [6.0, 3.0], "dwell_s is not in ascending"),
         ("corridor.recorded", [], "corridor.recorded is not an object"),
+        ("corridor.late_controls.0.later_s", 0.25, "late corridors do not rise"),
+        ("corridor.late_sensors.1.later_s", float("nan"), "late_sensors"),
+        ("corridor.late_sensors.0.later_s", 0.0, "later_s = 0.0 is not in"),
+        ("corridor.late_sensors.2.bounds.nominal", -1.0, "nominal = -1.0 is not in"),
+        ("corridor.late_controls", {}, "corridor.late_controls"),
     ],
 )
 def test_a_corridor_that_does_not_follow_or_would_break_a_reader_is_refused(

@@ -49,7 +49,6 @@ def _require_what_follows(corridor: Corridor) -> None:
             near(part.corridor_m, width, REPEATED),
             "corridor.corridor_m does not follow from its bounds",
         )
-
     for rows in (corridor.late_sensors, corridor.late_controls):
         require(
             all(one.later_s < next.later_s for one, next in pairwise(rows)),

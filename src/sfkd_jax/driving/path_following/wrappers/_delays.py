@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.driving.path_coordinates import HEADING, PathState
+from sfkd_jax.driving.path_following.wrappers._innovations import deviation_at
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.types import Scalar
 
@@ -97,7 +98,8 @@ class DelayEstimator(NamedTuple):
         known = used & jnp.all(jnp.isfinite(innovation))
         corrected = state.expected + GAIN * innovation
         estimate = jnp.where(known, corrected, jnp.where(used, xi, state.expected))
-        surprise = (innovation / self._deviation(state.level)) ** 2
+        deviation = deviation_at(state.level, self.levels, self.deviation)
+        surprise = (innovation / deviation) ** 2
         surprise = jnp.sum(jnp.minimum(surprise, LARGEST), axis=1)
         fit = jnp.where(known, MEMORY * state.fit - 0.5 * surprise, state.fit)
         best = jnp.argmax(fit)
@@ -107,14 +109,6 @@ class DelayEstimator(NamedTuple):
             fit=fit,
             best=jnp.where(changed, best, state.best).astype(jnp.int32),
         )
-
-    def _deviation(self, level: Scalar) -> PathState:
-        """Return σ of the innovations at a level of the law."""
-
-        def interpolate(column: Float[Array, " level"]) -> Scalar:
-            return jnp.interp(level, self.levels, column)
-
-        return jax.vmap(interpolate)(self.deviation.T)
 
     def delay(self, state: DelayState) -> Scalar:
         """Return the delay that is believed, in periods."""

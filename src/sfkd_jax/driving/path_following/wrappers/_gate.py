@@ -383,9 +383,9 @@ class Gate(Stateful):
         acts = acting(shown.later)
         starts = [believed.state.past[0, :-1], believed.xi]
         controls = [acts, acts + error]
-        if tests.delay is not None:
+        if self.tests.delay is not None and tests.delay is not None:
             starts += list(tests.delay.estimate)
-            controls += [acting(later) + error for later in self.delay.hypotheses]
+            controls += [acting(later) + error for later in self.tests.delay.later]
         return jnp.stack(starts), jnp.stack(controls)
 
 

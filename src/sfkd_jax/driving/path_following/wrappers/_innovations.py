@@ -91,11 +91,7 @@ class InnovationTest(NamedTuple):
     def moved(self, means: Means, innovation: Readings, level: Scalar) -> Means:
         """Return the moving means with one more innovation, NaN without one."""
         usual = self.deviation[0]
-
-        def interpolate(column: Float[Array, " level"]) -> Scalar:
-            return jnp.interp(level, self.levels, column)
-
-        deviation = jax.vmap(interpolate)(self.deviation.T)
+        deviation = deviation_at(level, self.levels, self.deviation)
         # The largest ratio serves all entries: where a model errs in one of them, it
         # errs in others for a while.
         ratio = jnp.max((deviation / usual)[:-1])
@@ -105,6 +101,25 @@ class InnovationTest(NamedTuple):
         # The means are held, not moved towards 0: a sensor that fails must not end an
         # alarm.
         return jnp.where(jnp.isnan(innovation), means, moved)
+
+
+def deviation_at(
+    level: Scalar,
+    levels: Float[Array, " level"],
+    deviation: Float[Array, "level column"],
+) -> Float[Array, " column"]:
+    """Return the standard deviations of innovations at a level of the law.
+
+    Args:
+        level: see `SteadyTurn.level`.
+        levels: at which they are known, rising.
+        deviation: at these levels.
+    """
+
+    def interpolate(column: Float[Array, " level"]) -> Scalar:
+        return jnp.interp(level, levels, column)
+
+    return jax.vmap(interpolate)(deviation.T)
 
 
 def innovation_test(
