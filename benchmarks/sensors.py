@@ -20,6 +20,7 @@ from benchmarks.latency import DEPARTED, SAMPLES
 from benchmarks.latency import loaded as restored
 from sfkd_jax import Latency
 from sfkd_jax.driving.paths import project, reference_window
+from sfkd_jax.geometry import rotate
 from sfkd_jax.info import Reason
 from sfkd_jax.latency import ReadingBuffer
 
@@ -43,6 +44,8 @@ class Faults(NamedTuple):
         scale: of the position.
         ahead: by how much the reference begins further ahead [m].
         spacing: of the way-points at one of which the reference begins [m]; 0 without.
+        offset: added to the position, ahead and to the left of the vehicle [m], and to
+            the yaw [rad].
     """
 
     held: np.ndarray
@@ -51,13 +54,22 @@ class Faults(NamedTuple):
     scale: np.ndarray
     ahead: np.ndarray
     spacing: np.ndarray
+    offset: np.ndarray
 
 
 def right(steps):
     """Faults of right sensors."""
     never = np.zeros(steps, bool)
     none = np.zeros(steps)
-    return Faults(never, never, none.astype(int), none + 1.0, none, none)
+    return Faults(
+        held=never,
+        lost=never,
+        late=none.astype(int),
+        scale=none + 1.0,
+        ahead=none,
+        spacing=none,
+        offset=np.zeros((steps, 3)),
+    )
 
 
 def held(steps, random):
@@ -104,6 +116,37 @@ def way_points(steps, random):
     return right(steps)._replace(spacing=np.full(steps, random.uniform(3.0, 5.0)))
 
 
+def since(steps, random, shortest, longest):
+    """Time since a fault began [s], which lasts so long; NaN before and after it."""
+    first = random.integers(FIRST, 2 * FIRST)
+    length = random.uniform(shortest, longest)
+    time = PERIOD * (np.arange(steps) - first)
+    return np.where((time >= 0.0) & (time <= length), time, np.nan)
+
+
+def turned(steps, random, largest):
+    """The yaw is wrong by an angle once, for 2 to 6 s."""
+    angle = random.uniform(0.0, largest) * random.choice((-1.0, 1.0))
+    on = np.isfinite(since(steps, random, 2.0, 6.0))
+    return right(steps)._replace(offset=angle * on[:, None] * np.eye(3)[2])
+
+
+def dragged(steps, random):
+    """The position is dragged off once, by 2 to 50 cm/s for 2 to 6 s."""
+    time = np.nan_to_num(since(steps, random, 2.0, 6.0))
+    direction = random.uniform(-np.pi, np.pi)
+    towards = np.asarray([np.cos(direction), np.sin(direction), 0.0])
+    way = random.uniform(0.02, 0.5) * time
+    return right(steps)._replace(offset=way[:, None] * towards)
+
+
+def jumped(steps, random):
+    """The position jumps 0.07 m to a side, and is dragged off to the other side."""
+    time = since(steps, random, 2.6, 2.6)
+    way = random.choice((-1.0, 1.0)) * np.nan_to_num(0.29 * time - 0.07)
+    return right(steps)._replace(offset=way[:, None] * np.eye(3)[1])
+
+
 CASES = {
     "right sensors": lambda steps, random: right(steps),
     "sensors stand still, with noise, 0.1 to 2.5 s": held,
@@ -111,6 +154,10 @@ CASES = {
     "one reading in six": sparse,
     "every reading 0 to 0.2 s late, no stamps": jitter,
     "position 2 % too far from the origin": scaled,
+    "position dragged off by 2 to 50 cm/s, for 2 to 6 s": dragged,
+    "position jumps 0.07 m to a side, then 0.29 m/s to the other, for 2.6 s": jumped,
+    "yaw up to 0.03 rad off, for 2 to 6 s": partial(turned, largest=0.03),
+    "yaw up to 0.1 rad off, for 2 to 6 s": partial(turned, largest=0.1),
     "reference 2 to 4 m further ahead, now and then": replanned,
     "reference begins at way-points 3 to 5 m apart": way_points,
     STAMPED: None,
@@ -140,7 +187,9 @@ def episode(policy, scene, faults, key):
         state = states[-1]
         kept = jnp.where(fault.held, kept, states[LATEST - fault.late])
         fresh = noise * jax.random.normal(noise_key, state.shape)
+        shift = rotate(state[2], fault.offset[:2])
         seen = kept.at[:2].multiply(fault.scale) + fresh
+        seen = seen.at[:2].add(shift).at[2].add(fault.offset[2])
         seen = jnp.where(fault.lost, jnp.nan, seen)
         points = jnp.maximum(fault.spacing, 1e-3)
         point = points * jnp.floor((along + BEHIND) / points) - BEHIND
@@ -197,7 +246,8 @@ def drive(car, cases, options):
         random = np.random.default_rng(options.seed)
         faults = [CASES[label](steps, random) for _ in range(options.episodes)]
         faults = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *faults)
-        wrong = np.asarray(faults.held | faults.lost | (faults.late > 0))
+        off = jnp.any(faults.offset != 0.0, axis=-1)
+        wrong = np.asarray(faults.held | faults.lost | (faults.late > 0) | off)
         yield label, numbers(run(scenes, faults, keys), wrong)
 
 

@@ -606,6 +606,46 @@ def test_what_one_step_cannot_explain_is_not_followed(name):
         )
 
 
+def heading_test():
+    """The test of innovations of a toy whose heading is within 10 deviations."""
+    size = jnp.full((len(path_following.WINDOWS), 4), jnp.inf)
+    test = path_following.InnovationTest(
+        levels=jnp.zeros(1),
+        deviation=0.002 * jnp.ones((1, 4)),
+        threshold=size.at[0, 1].set(10.0),
+    )
+    return path_following.MeasurementTests(innovation=test)
+
+
+@pytest.mark.parametrize("angle", [-0.05, 0.03])
+def test_a_yaw_that_is_wrong_by_a_little_is_not_followed(angle):
+    """The limit of a whole box would let it pass, and the vehicle follow it."""
+
+    def turned(o, k):
+        return o.at[2].add(jnp.where(between(k, 40, 80), angle, 0.0))
+
+    xi, info = told(turned, tests=heading_test())
+    trusting, _ = told(turned)
+    lost = np.asarray(info.claim.reason == Reason.NOT_MEASURED)
+    assert np.all(lost == between(np.arange(len(lost)), 40, 80))
+    assert np.max(np.abs(xi[:, 0])) < 0.5 * np.max(np.abs(trusting[:, 0]))
+    measured = np.asarray(info.gate.measured)[lost]
+    assert np.all(measured == [True, False, True])
+
+
+def test_a_vehicle_that_really_turned_is_believed_once_its_position_shows_it():
+    """As after a push on ice. Then nothing is claimed for a while."""
+    pushed = np.zeros((200, 3))
+    pushed[40, 1] = 0.05
+    xi, info = told(lambda o, k: o, 200, pushed, tests=heading_test())
+    lost = np.flatnonzero(info.claim.reason == Reason.NOT_MEASURED)
+    assert lost[0] == 41
+    assert lost[-1] < 41 + 15
+    assert info.claim.reason[lost[-1] + 1] == Reason.TRIAL
+    assert np.all(info.gate.measured[lost[-1] + 1 :])
+    np.testing.assert_allclose(xi[-1, :2], xi[40, :2], atol=0.01)
+
+
 BEGINNINGS = {
     "once 4 m ahead": lambda k: jnp.where(k == 50, 4.0, 0.0),
     "4 m ahead from then on": lambda k: jnp.where(k >= 50, 4.0, 0.0),

@@ -27,6 +27,10 @@ EVIDENCE = 16.0
 """Difference of log-likelihoods from which on another delay is believed. Innovations of
 a model are neither white nor Gaussian, so it is large.
 """
+EXPLAINED = 2.0
+"""Largest mean squared normalised innovation of a delay that is believed. No delay
+explains what a steering offset does.
+"""
 
 
 class DelayState(NamedTuple):
@@ -37,6 +41,7 @@ class DelayState(NamedTuple):
         estimate: ξ by each observer, after the measurement.
         level: of the prediction, see `SteadyTurn.level`.
         fit: log-likelihood of each delay over the last seconds.
+        steps: number of steps in it, each weighted as its likelihood is.
         best: index of the delay that is believed.
     """
 
@@ -44,6 +49,7 @@ class DelayState(NamedTuple):
     estimate: Float[Array, "delay coordinate"]
     level: Scalar
     fit: Float[Array, " delay"]
+    steps: Scalar
     best: Int[Array, ""]
 
 
@@ -54,8 +60,8 @@ class DelayEstimator(NamedTuple):
         fit_d ← λ fit_d − ½ Σ_i min(((ξ − ξ̂⁻_d)_i / σ_i(level))², 9)
 
     u_d is what acts if the commands are late by d. Another delay is believed once its
-    fit is better by `EVIDENCE`. Where the commands hardly change, all observers predict
-    the same, and the delay stays as it is.
+    fit is better by `EVIDENCE`, if it explains what is seen. Where the commands hardly
+    change, all observers predict the same, and the delay stays as it is.
 
     Attributes:
         levels: rising, of `SteadyTurn.level`.
@@ -79,6 +85,7 @@ class DelayEstimator(NamedTuple):
             estimate=unknown,
             level=jnp.zeros(()),
             fit=jnp.zeros(shape[0]),
+            steps=jnp.zeros(()),
             best=jnp.asarray(self.later.index(0.0), jnp.int32),
         )
 
@@ -102,11 +109,14 @@ class DelayEstimator(NamedTuple):
         surprise = (innovation / deviation) ** 2
         surprise = jnp.sum(jnp.minimum(surprise, LARGEST), axis=1)
         fit = jnp.where(known, MEMORY * state.fit - 0.5 * surprise, state.fit)
+        steps = jnp.where(known, MEMORY * state.steps + 1.0, state.steps)
         best = jnp.argmax(fit)
-        changed = fit[best] - fit[state.best] > EVIDENCE
+        explained = -2.0 * fit[best] <= EXPLAINED * xi.shape[0] * steps
+        changed = explained & (fit[best] - fit[state.best] > EVIDENCE)
         return state._replace(
             estimate=estimate,
             fit=fit,
+            steps=steps,
             best=jnp.where(changed, best, state.best).astype(jnp.int32),
         )
 

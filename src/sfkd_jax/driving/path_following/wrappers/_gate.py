@@ -24,9 +24,7 @@ from sfkd_jax.driving.path_following.tasks._preview import (
     state_beside,
 )
 from sfkd_jax.driving.path_following.wrappers._estimator import input_error
-from sfkd_jax.driving.path_following.wrappers._innovations import (
-    turning_rate,
-)
+from sfkd_jax.driving.path_following.wrappers._innovations import turning_rate
 from sfkd_jax.driving.path_following.wrappers._measurement_tests import (
     MeasurementTests,
     TestsState,
@@ -181,6 +179,7 @@ class Gate(Stateful):
             place=jnp.full(2, jnp.nan, dtype=float),
             missing=jnp.zeros(size, jnp.int32),
             skew=jnp.zeros(()),
+            aside=jnp.zeros(()),
             doubt=jnp.zeros((), jnp.int32),
             env=0.5 * jnp.sum(jnp.asarray(box, dtype=float), axis=0),
             road=jnp.zeros((self.horizon, 2)),
@@ -265,6 +264,7 @@ class Gate(Stateful):
         return Plausibility(
             dt=self.prediction.dt,
             box=self.prediction.conditions.state,
+            tests=self.tests,
             patience=self.patience,
             trial=self.trial,
             share=self.share,

@@ -102,6 +102,11 @@ class InnovationTest(NamedTuple):
         # alarm.
         return jnp.where(jnp.isnan(innovation), means, moved)
 
+    def largest_turn(self, level: Scalar) -> Scalar:
+        """Return the largest innovation of the heading that noise explains [rad]."""
+        deviation = deviation_at(level, self.levels, self.deviation)
+        return self.threshold[0, HEADING] * deviation[HEADING]
+
 
 def deviation_at(
     level: Scalar,

@@ -56,6 +56,16 @@ class MeasurementTests(NamedTuple):
             return jnp.zeros(())
         return self.delay.delay(state.delay)
 
+    def largest_turn(self, state: TestsState) -> Scalar:
+        """Return the largest innovation of the heading that noise explains [rad].
+
+        After an alarm the model is no measure any more, and it is infinite.
+        """
+        if self.innovation is None or state.innovation is None:
+            return jnp.asarray(jnp.inf)
+        largest = self.innovation.largest_turn(state.innovation.level)
+        return jnp.where(state.innovation.alarm, jnp.inf, largest)
+
     def update(
         self,
         state: TestsState,

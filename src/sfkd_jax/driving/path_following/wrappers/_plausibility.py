@@ -21,7 +21,10 @@ from sfkd_jax.driving.path_coordinates import (
 )
 from sfkd_jax.driving.path_following.tasks._preview import Preview
 from sfkd_jax.driving.path_following.wrappers._conditions import Box
-from sfkd_jax.driving.path_following.wrappers._measurement_tests import TestsState
+from sfkd_jax.driving.path_following.wrappers._measurement_tests import (
+    MeasurementTests,
+    TestsState,
+)
 from sfkd_jax.geometry import put, wrap_angle
 from sfkd_jax.types import Environment, Scalar
 
@@ -43,6 +46,12 @@ AS_LATE = 0.5
 """Share of the limits by which a late observation may differ from the estimate of its
 time. A wrong position is behind on the path as well, and rarely that close.
 """
+SAME_TURN = 0.5
+"""Share of the largest innovation of the heading by which a wrong yaw may change."""
+COURSE_WEIGHT = 0.1
+"""Weight of the newest lateral innovation in their mean while a yaw is refused."""
+COURSE_NOISE = 0.01
+"""Mean lateral innovation [m] that noise explains."""
 
 
 class GateState(NamedTuple):
@@ -56,6 +65,7 @@ class GateState(NamedTuple):
             measurement, and in the frame of the vehicle.
         missing: number of steps since each coordinate was last used.
         skew: what a wrong pose adds to the relative yaw [rad]; 0 for a right one.
+        aside: mean lateral innovation since a yaw is refused [m].
         doubt: number of steps until the certificate may be claimed again, after a
             measurement was believed that nothing explains.
         env: the last finite environment.
@@ -71,6 +81,7 @@ class GateState(NamedTuple):
     place: Float[Array, " 2"]
     missing: Int[Array, " coordinate"]
     skew: Scalar
+    aside: Scalar
     doubt: Int[Array, ""]
     env: Environment
     road: Float[Array, "preview 2"]
@@ -96,6 +107,20 @@ class Believed(NamedTuple):
     state: GateState
 
 
+class Yaw(NamedTuple):
+    """What is believed of a measured yaw.
+
+    Attributes:
+        plausible: whether it may be right.
+        skew: by which angle it is wrong if it is not [rad].
+        aside: mean lateral innovation while a yaw is refused [m].
+    """
+
+    plausible: Bool[Array, ""]
+    skew: Scalar
+    aside: Scalar
+
+
 class Earlier(NamedTuple):
     """A measurement that lies behind on the path, as one of an earlier step.
 
@@ -117,6 +142,7 @@ class Plausibility:
     Attributes:
         dt: sampling period [s].
         box: of ξ, in which the model predicts; None without one.
+        tests: of the innovations, whose noise they know.
         patience: longest time on the prediction [s].
         trial: time without a claim after an implausible measurement was believed [s].
         share: of the half widths of the box of ξ that one step may be off.
@@ -126,6 +152,7 @@ class Plausibility:
 
     dt: float
     box: Box | None
+    tests: MeasurementTests
     patience: float
     trial: float
     share: float
@@ -151,8 +178,14 @@ class Plausibility:
         compared = all_finite(expected)
         innovation = difference(observed, expected)
         limit = self._limit(state, periods, preview.on_time)
+        # Where no model predicted, the noise of its innovations says nothing.
+        modelled = state.modelled & preview.on_time
+        largest_turn = self.tests.largest_turn(state.tests)
+        largest_turn = jnp.where(modelled, largest_turn, jnp.inf)
         grown = limit * (1.0 + self.growth * state.missing)
+        yaw = self._yaw(state, innovation, grown[HEADING], largest_turn)
         plausible = jnp.abs(innovation) <= grown
+        plausible = put(plausible, HEADING, yaw.plausible)
         moving = jnp.abs(expected[PATH_SPEED]) > MOVING
         seen = jnp.isfinite(observed) & ~(preview.repeated & moving)
 
@@ -173,6 +206,7 @@ class Plausibility:
         measured = usable & (plausible | overdue | ~compared)
         # Either this measurement or all that was believed before is wrong, and nothing
         # says which.
+        limit = put(limit, HEADING, jnp.minimum(limit[HEADING], largest_turn))
         unexplained = ~(jnp.abs(innovation) <= limit) | shifted
         forced = compared & jnp.any(measured & unexplained)
         missing = jnp.where(measured, 0, state.missing + 1)
@@ -180,9 +214,8 @@ class Plausibility:
         xi = jnp.where(measured, observed, expected)
         xi = jnp.where(late, expected + earlier.difference_now, xi)
 
-        skew = self._skew(state.skew, innovation[HEADING], grown[HEADING])
         skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
-        heading = jnp.where(skewed, observed[HEADING] - skew, xi[HEADING])
+        heading = jnp.where(skewed, observed[HEADING] - yaw.skew, xi[HEADING])
         xi = put(xi, HEADING, heading)
         # A believed outlier starts anew; noise is averaged.
         estimate = expected + self.gain * difference(xi, expected)
@@ -194,7 +227,8 @@ class Plausibility:
         along = along + jnp.where(jnp.all(measured), gain * gap, 0.0)
         after = state._replace(
             missing=missing,
-            skew=jnp.where(skewed, skew, 0.0),
+            skew=jnp.where(skewed, yaw.skew, 0.0),
+            aside=jnp.where(skewed & measured[LATERAL], yaw.aside, 0.0),
             doubt=jnp.where(forced, round(self.trial / self.dt), state.doubt),
             past=jnp.concatenate([here[None], past[:-1]]),
         )
@@ -216,14 +250,41 @@ class Plausibility:
         _, along = place_on(state.place, points, curvature_ahead(points))
         return jnp.where(jnp.isfinite(along), along, preview.along)
 
-    def _skew(self, before: Scalar, innovation: Scalar, limit: Scalar) -> Scalar:
-        """Return by which angle a wrong yaw is wrong [rad].
+    def _yaw(
+        self,
+        state: GateState,
+        innovation: PathState,
+        limit: Scalar,
+        largest_turn: Scalar,
+    ) -> Yaw:
+        """Return whether a yaw is believed, and by which angle it else is wrong.
 
         A yaw that is wrong stays wrong by the same angle, and so does a yaw relative to
-        the wrong place of a bend. Its changes are therefore still measured.
+        the wrong place of a bend. Its changes are therefore still measured. One that
+        goes on changing is that of a vehicle that turns, as on ice. If the yaw was
+        right and what was believed before it is wrong, the vehicle comes aside of its
+        prediction by that angle.
+
+        Args:
+            state: of the gate after the last step.
+            innovation: of ξ.
+            limit: of the heading [rad].
+            largest_turn: see `MeasurementTests.largest_turn`.
         """
-        stays = jnp.abs(wrap_angle(innovation - before)) <= limit
-        return jnp.where((before != 0.0) & stays, before, innovation)
+        turned = innovation[HEADING]
+        refused = state.skew != 0.0
+        gap = jnp.abs(wrap_angle(turned - state.skew))
+        stays = refused & (gap <= jnp.minimum(limit, SAME_TURN * largest_turn))
+        skew = jnp.where(stays, state.skew, turned)
+        # One that is refused is believed again once it is nearer to right than wrong.
+        largest = jnp.where(stays, 0.5 * jnp.abs(skew), largest_turn)
+        jumped = (jnp.abs(turned) > largest) & (stays | ~refused)
+        aside = state.aside + COURSE_WEIGHT * (innovation[LATERAL] - state.aside)
+        way = jnp.abs(state.expected[PATH_SPEED]) * self.dt
+        half = jnp.maximum(0.5 * jnp.abs(skew) * way, COURSE_NOISE)
+        confirmed = stays & (aside * jnp.sign(skew) > half)
+        plausible = (jnp.abs(turned) <= limit) & ~jumped
+        return Yaw(plausible | confirmed, skew, aside)
 
     def _earlier(
         self, state: GateState, xi: PathState, curvature: Scalar, gap: Scalar
