@@ -25,12 +25,16 @@ SAMPLES = 64
 
 
 class Case(NamedTuple):
-    """Delays in seconds: what is true of the car, and what its controller assumes."""
+    """Delays in seconds: what is true of the car, and what its controller assumes.
+
+    `environment` is by how much later than the state friction and wind are known.
+    """
 
     sensors: float = 0.0
     controls: float = 0.0
     assumed_sensors: float | None = None
     assumed_controls: float | None = None
+    environment: float = 0.0
 
     @property
     def true(self):
@@ -62,6 +66,7 @@ CASES = {
     **{f"sensors {late} s": Case(late, 0.0) for late in (0.1, 0.2, 0.3)},
     **{f"controls {late} s": Case(0.0, late) for late in (0.1, 0.2, 0.3)},
     **{f"half each, {late} s": Case(late / 2, late / 2) for late in (0.1, 0.2, 0.3)},
+    **{f"e known {late} s later": Case(environment=late) for late in (0.1, 0.2, 0.3)},
     "sensors 0.1 s, nothing assumed": Case(0.1, 0.0, 0.0, 0.0),
     "controls 0.1 s, nothing assumed": Case(0.0, 0.1, 0.0, 0.0),
     "sensors 0.2 s, nothing assumed": Case(0.2, 0.0, 0.0, 0.0),
@@ -87,6 +92,9 @@ def drive(path, case, options):
     sample = family(car, "s3", options.seconds, speed=10.0)
     road_key, drive_key = jax.random.split(jax.random.key(options.seed))
     scenes = jax.jit(jax.vmap(sample))(jax.random.split(road_key, options.episodes))
+    steps = np.arange(scenes.envs.shape[1])
+    known = np.maximum(steps - round(case.environment / car.dt), 0)
+    scenes = scenes._replace(observed_envs=scenes.envs[:, known])
     episode = driving(
         car,
         driver.controller,

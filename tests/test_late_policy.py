@@ -68,6 +68,17 @@ def test_a_latency_that_nobody_stated_is_found_and_compensated():
     np.testing.assert_allclose(claim.bound[-1], row.corridor_m, rtol=1e-3)
 
 
+def test_of_a_car_that_is_less_late_than_stated_a_corridor_is_claimed_as_well():
+    stated = sfkd_jax.load("kinematic_path", latency=sfkd_jax.Latency((), (0.2,)))
+    driven = episode(stated, sfkd_jax.Latency())
+    later = driven.signals["gate"].later
+    claim = driven.signals["claim"]
+    assert (later[100:] == -2.0).all()
+    corridor = stated.certificate.corridor
+    np.testing.assert_allclose(claim.bound[-1], corridor.corridor_m, rtol=1e-3)
+    assert claim.bound[0] > corridor.late_controls[1].corridor_m - 1e-3
+
+
 def test_of_a_latency_that_no_corridor_covers_nothing_is_claimed():
     later = sfkd_jax.load("kinematic_path", latency=sfkd_jax.Latency((0.5,)))
     state = later.controller.init(jax.random.key(0))

@@ -78,7 +78,7 @@ def in_corridor(
         model=model,
         law=law,
         width=bounds.nominal,
-        tube=tubes[0][1] if tubes else bounds.vehicle_to_nominal_position,
+        tube=_tube_as_stated(tubes) or bounds.vehicle_to_nominal_position,
         late=tubes,
         horizon=corridor.shield_horizon,
         noise_allowance=ALLOWANCE * lateral_noise,
@@ -104,8 +104,8 @@ def _tubes(
 
     Returns:
         Pairs of periods and tube [m], rising. A tube holds for vehicles that are later
-        by up to so many periods, of whatever. It is empty if the corridor is of another
-        latency.
+        by up to so many periods, of whatever, and no less late than the first pair. It
+        is empty if the corridor is of another latency.
     """
     sizes = (len(plant.states), len(plant.controls))
     stated = latency.sized(*sizes)
@@ -122,16 +122,22 @@ def _tubes(
     if min(gaps) < 0.0:
         return ()
     longest = max(gaps)
-    tubes = _late_tubes(corridor, corridor.late_controls, plant.dt)
-    known = {periods: tube for periods, tube in tubes.items() if periods >= longest}
+    known = _late_tubes(corridor, corridor.late_controls, plant.dt)
     if stated.controls == calibrated.controls:
         # Nothing but the sensors is later, so e is known in time.
         tubes = _late_tubes(corridor, corridor.late_sensors, plant.dt)
         enough = [tube for periods, tube in tubes.items() if periods >= longest]
         if enough:
             known[longest] = enough[0]
+    if max(known) < longest:
+        return ()
     pairs = sorted(known.items())
     return tuple((periods - longest, tube) for periods, tube in pairs)
+
+
+def _tube_as_stated(tubes: tuple[tuple[float, float], ...]) -> float | None:
+    """Return the tube of a vehicle that is as late as stated [m], if it is known."""
+    return next((tube for periods, tube in tubes if periods >= 0.0), None)
 
 
 def _late_tubes(

@@ -755,8 +755,9 @@ def test_the_bound_of_a_start_at_a_measurement_decays_to_the_certified_one():
 
 def test_of_a_vehicle_that_is_later_the_bound_of_that_delay_is_claimed():
     """Nothing is claimed where none is known."""
+    earlier = 0.2
     wider = 0.3
-    options = {"tube": TUBE, "late": ((0.0, TUBE), (1.0, wider))}
+    options = {"tube": TUBE, "late": ((-1.0, earlier), (0.0, TUBE), (1.0, wider))}
     options |= {"inner": scripted(), "model": TOY, "law": LAW, "width": WIDTH}
     shield = path_following.Shield(control=(LOW, HIGH), **options).controller()
 
@@ -771,10 +772,11 @@ def test_of_a_vehicle_that_is_later_the_bound_of_that_delay_is_claimed():
         script = jnp.zeros((1, 2))
         return controller.act(script, start, seen, ENV, circle())[2].claim
 
-    for later, tube in ((0.0, TUBE), (0.5, wider), (1.0, wider)):
+    tubes = ((-1.0, earlier), (0.0, TUBE), (0.5, wider), (1.0, wider))
+    for later, tube in tubes:
         bound = claim(jnp.asarray(later)).bound
         np.testing.assert_allclose(bound, WIDTH + tube, rtol=1e-6)
-    for unknown in (1.5, -0.5):
+    for unknown in (1.5, -2.0):
         nothing = claim(jnp.asarray(unknown))
         assert nothing.reason == Reason.NOT_CALIBRATED
         assert np.isnan(nothing.bound)

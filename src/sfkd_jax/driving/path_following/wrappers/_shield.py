@@ -111,8 +111,8 @@ class Shield(Stateful):
         rear: distance from the rear axle to the position of the vehicle [m], see
             `RollingCorridor`.
         late: pairs of periods and tube [m], rising: the bounds for vehicles that are
-            later than stated by up to so many periods. Nothing is claimed of others
-            that are (NOT_CALIBRATED).
+            later than stated by up to so many periods. Nothing is claimed of vehicles
+            that are still later, or less late than the first pair (NOT_CALIBRATED).
         claimed: whether `width` and `tube` are known of the vehicle itself. If they are
             known only of a model of it, nothing is claimed (NOT_CALIBRATED).
 
@@ -229,7 +229,8 @@ class Shield(Stateful):
         for periods, bound in reversed(self.late):
             tube = jnp.where(later <= periods, bound, tube)
         tube = jnp.where(later == 0.0, self.tube, tube)
-        return jnp.where(later < 0.0, jnp.inf, tube)
+        least = min(0.0, self.late[0][0]) if self.late else 0.0
+        return jnp.where(later < least, jnp.inf, tube)
 
     def _nominal(self, tube: Scalar | float) -> NominalModel:
         """Return the model that the shield keeps in its corridor."""
