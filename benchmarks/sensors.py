@@ -131,6 +131,12 @@ def turned(steps, random, largest):
     return right(steps)._replace(offset=angle * on[:, None] * np.eye(3)[2])
 
 
+def mounted(steps, random):
+    """The yaw is 0.04 rad off from the start."""
+    angle = 0.04 * random.choice((-1.0, 1.0))
+    return right(steps)._replace(offset=np.tile(angle * np.eye(3)[2], (steps, 1)))
+
+
 def dragged(steps, random):
     """The position is dragged off once, by 2 to 50 cm/s for 2 to 6 s."""
     time = np.nan_to_num(since(steps, random, 2.0, 6.0))
@@ -158,6 +164,7 @@ CASES = {
     "position jumps 0.07 m to a side, then 0.29 m/s to the other, for 2.6 s": jumped,
     "yaw up to 0.03 rad off, for 2 to 6 s": partial(turned, largest=0.03),
     "yaw up to 0.1 rad off, for 2 to 6 s": partial(turned, largest=0.1),
+    "yaw 0.04 rad off from the start": mounted,
     "reference 2 to 4 m further ahead, now and then": replanned,
     "reference begins at way-points 3 to 5 m apart": way_points,
     STAMPED: None,
