@@ -633,6 +633,18 @@ def test_a_yaw_that_is_wrong_by_a_little_is_not_followed(angle):
     assert np.all(measured == [True, False, True])
 
 
+def test_a_yaw_is_measured_while_a_position_is_wrong():
+    """Its noise is no reason to refuse it."""
+
+    def jumped(o, k):
+        noise = 1e-3 * (1.0 - 2.0 * (k % 2))
+        return FAULTS["jump"](o, k).at[2].add(noise)
+
+    _, info = told(jumped, tests=heading_test())
+    lost = np.asarray(info.claim.reason == Reason.NOT_MEASURED)
+    assert np.asarray(info.gate.measured)[lost].tolist() == [[False, True, True]] * 18
+
+
 def test_a_vehicle_that_really_turned_is_believed_once_its_position_shows_it():
     """As after a push on ice. Then nothing is claimed for a while."""
     pushed = np.zeros((200, 3))

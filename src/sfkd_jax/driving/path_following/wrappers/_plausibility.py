@@ -272,17 +272,19 @@ class Plausibility:
             largest_turn: see `MeasurementTests.largest_turn`.
         """
         turned = innovation[HEADING]
-        refused = state.skew != 0.0
+        skewed = state.skew != 0.0
         gap = jnp.abs(wrap_angle(turned - state.skew))
-        stays = refused & (gap <= jnp.minimum(limit, SAME_TURN * largest_turn))
+        stays = skewed & (gap <= jnp.minimum(limit, SAME_TURN * largest_turn))
         skew = jnp.where(stays, state.skew, turned)
-        # One that is refused is believed again once it is nearer to right than wrong.
-        largest = jnp.where(stays, 0.5 * jnp.abs(skew), largest_turn)
+        # Otherwise it was the position that was refused.
+        refused = skewed & (state.missing[HEADING] > 0)
+        # It is believed again once it is nearer to right than wrong.
+        largest = jnp.where(refused & stays, 0.5 * jnp.abs(skew), largest_turn)
         jumped = (jnp.abs(turned) > largest) & (stays | ~refused)
         aside = state.aside + COURSE_WEIGHT * (innovation[LATERAL] - state.aside)
         way = jnp.abs(state.expected[PATH_SPEED]) * self.dt
         half = jnp.maximum(0.5 * jnp.abs(skew) * way, COURSE_NOISE)
-        confirmed = stays & (aside * jnp.sign(skew) > half)
+        confirmed = refused & stays & (aside * jnp.sign(skew) > half)
         plausible = (jnp.abs(turned) <= limit) & ~jumped
         return Yaw(plausible | confirmed, skew, aside)
 
