@@ -179,7 +179,8 @@ def _step_of_model(simulate: _Simulation, name: str) -> Step:
 def _learned_step(simulate: _Simulation) -> Step:
     """Return the step of a regression of runs without a law, over the law's axes."""
     plant = simulate.plant
-    law = simulate.drives.law
+    drives: Any = simulate.drives
+    law = drives.law
     box = simulate.box
     seed = simulate.key(OPEN_LOOP_STREAM)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
@@ -191,7 +192,7 @@ def _learned_step(simulate: _Simulation) -> Step:
         plant,
         speed=(0.8 * slowest, 1.1 * fastest),
         lateral_acceleration=1.2 * law.lateral_acceleration,
-        tightest=TIGHTEST_CIRCLES * simulate.drives.peak_curvature,
+        tightest=TIGHTEST_CIRCLES * drives.peak_curvature,
         **box,
     )
     driven = jax.jit(drive)(run_key)
@@ -261,9 +262,9 @@ def _check_law(simulate: _Simulation, law: PathLaw, step: Step) -> None:
     largest = 1e3 * LARGEST_ERROR * plant.wheelbase
     if not error <= largest:
         raise ValueError(
-            f"{line}, more than {largest:.0f} mm, a tenth of its wheelbase: the weights "
-            "dataset.law.curvature, lateral and heading do not suit the vehicle, or its "
-            "roads need more than tyres and steering give"
+            f"{line}, more than {largest:.0f} mm, a tenth of its wheelbase: the "
+            "weights dataset.law.curvature, lateral and heading do not suit the "
+            "vehicle, or its roads need more than tyres and steering give"
         )
 
 
@@ -336,9 +337,9 @@ def _left_path(runs: Trajectory) -> np.ndarray:
 
     No run was, if the runs are not in path coordinates.
     """
-    controls = np.asarray(runs.controls)
+    controls = jnp.asarray(runs.controls)
     if controls.shape[-1] <= REFERENCE_SPEED:
         return np.zeros(len(controls), bool)
-    lateral = np.asarray(runs.states)[:, :-1, BODY.start + LATERAL]
-    valid = np.asarray(is_valid(lateral, controls[..., CURVATURE]))
-    return np.any(np.isfinite(lateral) & ~valid, axis=1)
+    lateral = jnp.asarray(runs.states)[:, :-1, BODY.start + LATERAL]
+    beyond = ~is_valid(lateral, controls[..., CURVATURE])
+    return np.asarray(jnp.any(jnp.isfinite(lateral) & beyond, axis=1))

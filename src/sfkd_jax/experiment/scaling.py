@@ -179,7 +179,7 @@ def _sensors(
     a large vehicle are no worse than those of a car.
     """
     noise = dict(_get(settings, NOISE))
-    for state in settings.vehicle.state_names:
+    for state in _get(settings, "vehicle.state_names"):
         is_stated = noise.get(state) is not None or _is_typed(f"{NOISE}.{state}", typed)
         if state in SENSORS and not is_stated:
             factor = min(1.0, SENSORS[state].factor(scale))

@@ -175,9 +175,7 @@ class DataSource:
         if not self.has_simulator or self.environment.low is None:
             return
         vehicle: Any = self.vehicle
-        found = hidden_change(
-            vehicle.env, self.plant, speed=settings.speed, **self.box
-        )
+        found = hidden_change(vehicle.env, self.plant, speed=settings.speed, **self.box)
         if not found:
             return
         listed = ", ".join(f"{name} by {value:.3g}" for name, value in found.items())

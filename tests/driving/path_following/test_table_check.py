@@ -38,7 +38,9 @@ def step_of_clipped_steering(limit, state, control, env):
 
 def derived(step, coordinates=3, **options):
     return jit(
-        partial(derive_path_law, step, coordinates=coordinates, **BOX, **GRID, **options)
+        partial(
+            derive_path_law, step, coordinates=coordinates, **BOX, **GRID, **options
+        )
     )()
 
 
@@ -98,7 +100,9 @@ def test_a_gain_of_zero_is_that_of_the_next_smaller_curvature(law):
     gain[0, 1, 0, 1] = 0.0
     gain[:3, 0, 1, 1] = 0.0
     gain[4, 0, 0, 0] = np.nan
-    checked, (finding,) = checked_law(law._replace(gain=jnp.asarray(gain)), tightest=1.0)
+    checked, (finding,) = checked_law(
+        law._replace(gain=jnp.asarray(gain)), tightest=1.0
+    )
     filled = np.asarray(checked.gain)
     np.testing.assert_array_equal(filled[0, 1, 0, 1], gain[1, 1, 0, 1])
     # Straight ahead has none either: the nearest turn that has one.

@@ -1,4 +1,4 @@
-"""What is wrong in the tables of a law: turns that were not found, and gains of zero."""
+"""Holes in the tables of a law: turns that were not found, and gains of zero."""
 
 from __future__ import annotations
 
@@ -80,10 +80,12 @@ def checked_law(law: PathLaw, *, tightest: float) -> CheckedLaw:
     """
     has_turn = _found_turns(law)
     gain = np.array(law.gain)
-    has_gain = np.isfinite(gain).all(axis=(-2, -1)) & gain.any(axis=(-2, -1))
+    finite = np.isfinite(gain).all(axis=(-2, -1))
+    has_gain = np.logical_and(finite, gain.any(axis=(-2, -1)))
     middle = len(gain) // 2
     _require_anywhere(law, has_turn[middle], "finds no steady driving straight ahead")
-    _require_anywhere(law, has_gain.any(axis=0), "has no gain at any curvature")
+    has_any_gain = np.asarray(has_gain.any(axis=0))
+    _require_anywhere(law, has_any_gain, "has no gain at any curvature")
     findings = []
     if not has_turn.all():
         curvatures = np.abs(_curvatures(law))[~has_turn]
