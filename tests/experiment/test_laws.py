@@ -76,3 +76,35 @@ def test_a_law_of_the_plant_is_checked_and_states_that_never_settle_are_named(ca
     assert np.abs(np.asarray(law.gain)[..., 0, 0]).min() > 0.1
     with pytest.raises(ValueError, match="a tenth of its wheelbase: the weights"):
         derived("dataset.law.curvature=1e9")
+
+
+VEHICLES = {
+    "truck": (
+        "vehicle.wheelbase=9",
+        "vehicle.state_names=[p_x,p_y,yaw,v,v_y,yaw_rate,steering]",
+        "vehicle.control_low=[-0.5,-4]",
+        "vehicle.control_high=[0.5,1]",
+    ),
+    "robot": (
+        "vehicle.wheelbase=0.5",
+        "vehicle.control_low=[-0.5,-1]",
+        "vehicle.control_high=[0.5,1]",
+        "dataset.speed=[0.3,1.0]",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_a_truck_and_a_robot_have_a_law_from_what_they_state(name):
+    """The derivation refuses one that strays by more than a tenth of the wheelbase."""
+    source = run(
+        "+experiment=s3",
+        "vehicle=own",
+        f"vehicle.step=tests.experiment.vehicles:{name}",
+        "dataset.law.model=plant",
+        "dataset.law.points=[7,5,3]",
+        *VEHICLES[name],
+    ).source
+    law = laws.derive_law(source.plant, source.along_path, source.box)
+    gain = np.asarray(law.gain)
+    assert (gain[..., 0, :2] > 0.0).all()

@@ -260,12 +260,17 @@ def _check_law(simulate: _Simulation, law: PathLaw, step: Step) -> None:
             "dataset.law.lateral_acceleration, or pass dataset.law.model=plant"
         )
     largest = 1e3 * LARGEST_ERROR * plant.wheelbase
-    if not error <= largest:
-        raise ValueError(
-            f"{line}, more than {largest:.0f} mm, a tenth of its wheelbase: the "
-            "weights dataset.law.curvature, lateral and heading do not suit the "
-            "vehicle, or its roads need more than tyres and steering give"
-        )
+    if error <= largest:
+        return
+    cause = (
+        "the weights dataset.law.curvature, lateral and heading do not suit the "
+        "vehicle, or its roads need more than tyres and steering give"
+    )
+    if step is not plant.step:
+        cause = f"its model is rough (dataset.law.model=plant has none), or {cause}"
+    raise ValueError(
+        f"{line}, more than {largest:.0f} mm, a tenth of its wheelbase: {cause}"
+    )
 
 
 def _lateral_error(simulate: _Simulation, step: Step) -> Callable[[PathLaw], float]:

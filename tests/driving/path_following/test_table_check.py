@@ -63,7 +63,9 @@ def test_states_that_never_settle_are_found_and_leave_the_law_as_it_is(law):
     np.testing.assert_allclose(longer.gain[..., 3:6], 0.0, atol=1e-4)
     holes = derived(with_states_that_never_settle, size)
     assert not _found_turns(holes).any()
-    with pytest.raises(ValueError, match="no steady driving straight ahead at 8 m/s"):
+    with pytest.raises(
+        ValueError, match="no steady driving straight ahead, as at 8 m/s"
+    ):
         checked_law(holes, tightest=0.2)
 
 
@@ -112,6 +114,29 @@ def test_a_gain_of_zero_is_that_of_the_next_smaller_curvature(law):
     np.testing.assert_array_equal(filled[whole], gain[whole])
     assert f"{(~whole).sum()} of {whole.size} points" in finding
     gain[:, 1, 1, 0] = 0.0
-    reason = r"no gain at any curvature at 10.5 m/s, kappa = 0 1/m, e = \(0.9, -8\)"
+    reason = r"no gain at any curvature, as at 10.5 m/s, kappa = 0 1/m, e = \(0.9, -8\)"
     with pytest.raises(ValueError, match=reason):
         checked_law(law._replace(gain=jnp.asarray(gain)), tightest=1.0)
+
+
+def test_a_straight_that_was_not_found_is_that_of_the_nearest_speed_and_e(law):
+    """Without a turn the derivation leaves ξ* = 0 and u* = 0, and no speed."""
+    tables = {
+        name: np.array(getattr(law, name)) for name in ("state", "control", "gain")
+    }
+    for name in ("state", "control"):
+        tables[name][2, 1, 0, 0] = 0.0
+    tables["gain"][2, 1, 0, 0] = 7.0
+    holed = law._replace(**{name: jnp.asarray(table) for name, table in tables.items()})
+    checked, (finding,) = checked_law(holed, tightest=1.0)
+    assert (
+        "at 1 of 8 speeds and e (10.5 m/s, kappa = 0 1/m, e = (0.3, -8), …)" in finding
+    )
+    np.testing.assert_array_equal(checked.gain[2, 1, 0, 0], law.gain[2, 0, 0, 0])
+    np.testing.assert_array_equal(checked.control[2, 1, 0, 0], law.control[2, 0, 0, 0])
+    assert checked.state[2, 1, 0, 0, 2] == 10.5
+    others = np.ones(law.gain.shape[:4], bool)
+    others[2, 1, 0, 0] = False
+    np.testing.assert_array_equal(
+        np.asarray(checked.gain)[others], np.asarray(law.gain)[others]
+    )

@@ -226,23 +226,53 @@ def steady_turn(
     free = jnp.asarray([i for i in (1, *range(3, size + 2)) if i not in unsettled])
     steady_rows = jnp.asarray([i for i in range(size) if i not in unsettled])
 
-    def newton(_: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        unknowns, _, _ = carry
-        turn = start.at[free].set(unknowns)
+    def newton(_: Any, carry: _Search) -> _Search:
+        turn = start.at[free].set(carry.unknowns)
         after, slopes = by_differences(moved, turn)
         gap = (after - turn[:size])[steady_rows]
         # A square matrix: two controls take the places of the two fixed coordinates.
         matrix = (slopes - jnp.eye(size, size + 2))[steady_rows][:, free]
-        better = unknowns - solve(matrix, gap[:, None])[:, 0]
-        # A NaN compares as False, so a turn that diverged is never steady.
-        steady = jnp.max(jnp.abs(gap)) < RESIDUAL_TOLERANCE
-        return better, turn, steady & jnp.all(jnp.isfinite(turn))
+        better = carry.unknowns - solve(matrix, gap[:, None])[:, 0]
+        # A NaN compares as False, so a turn that diverged is never the nearest.
+        residual = jnp.where(
+            jnp.all(jnp.isfinite(turn)), jnp.max(jnp.abs(gap)), jnp.inf
+        )
+        is_nearer = residual < carry.nearest_residual
+        return _Search(
+            unknowns=better,
+            turn=turn,
+            residual=residual,
+            nearest=jnp.where(is_nearer, turn, carry.nearest),
+            nearest_residual=jnp.minimum(residual, carry.nearest_residual),
+        )
 
-    carry = (start[free], start, jnp.asarray(False))
+    far = jnp.asarray(jnp.inf)
+    search = _Search(start[free], start, far, start, far)
     # The loop holds the only copy of the step and its derivative, which take long to
     # compile. Its last pass evaluates them where the others have led.
-    _, turn, steady = jax.lax.fori_loop(0, NEWTON + 1, newton, carry)
-    return turn, steady
+    search = jax.lax.fori_loop(0, NEWTON + 1, newton, search)
+    converged = search.residual < RESIDUAL_TOLERANCE
+    # A learned model is rough, and Newton's method may leave its turn again.
+    turn = jnp.where(converged, search.turn, search.nearest)
+    return turn, converged | (search.nearest_residual < RESIDUAL_TOLERANCE)
+
+
+class _Search(NamedTuple):
+    """Newton's method on the way to a steady turn.
+
+    Attributes:
+        unknowns: of the next turn to try.
+        turn: that was tried last.
+        residual: of that turn; infinite if it is not finite.
+        nearest: the turn with the smallest residual so far.
+        nearest_residual: of that turn.
+    """
+
+    unknowns: Array
+    turn: Array
+    residual: Scalar
+    nearest: Array
+    nearest_residual: Scalar
 
 
 def riccati_gain(

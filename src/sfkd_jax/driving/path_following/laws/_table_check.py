@@ -13,6 +13,8 @@ from sfkd_jax.driving.path_following.laws._derivation import by_differences
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.types import Step
 
+LEAST_STRAIGHT = 0.5
+"""Share of speeds and e at which driving straight ahead must be found."""
 UNSETTLED = 1e-4
 """Largest entry of a row or a column of F − I that counts as zero."""
 
@@ -68,32 +70,67 @@ def checked_law(law: PathLaw, *, tightest: float) -> CheckedLaw:
     """Return a law whose gains of zero are filled, and what was found in its tables.
 
     A point without a gain takes the gain of the next smaller curvature that has one. A
-    point without a steady turn has that of the next smaller curvature already.
+    point without a steady turn has that of the next smaller curvature already, and
+    where driving straight ahead is missing that of the nearest speed and e is used.
 
     Args:
         law: of `derive_path_law`.
         tightest: curvature that the steering reaches at its limit [1/m].
 
     Raises:
-        ValueError: no driving straight ahead was found, or no gain at any curvature;
-            gives speed and e.
+        ValueError: no driving straight ahead was found at half of the speeds and e or
+            more, or no gain at any curvature; gives speed and e.
     """
     has_turn = _found_turns(law)
-    gain = np.array(law.gain)
-    finite = np.isfinite(gain).all(axis=(-2, -1))
-    has_gain = np.logical_and(finite, gain.any(axis=(-2, -1)))
-    middle = len(gain) // 2
-    _require_anywhere(law, has_turn[middle], "finds no steady driving straight ahead")
-    has_any_gain = np.asarray(has_gain.any(axis=0))
-    _require_anywhere(law, has_any_gain, "has no gain at any curvature")
+    middle = len(has_turn) // 2
     findings = []
-    if not has_turn.all():
-        curvatures = np.abs(_curvatures(law))[~has_turn]
+    is_straight = has_turn[middle]
+    if is_straight.mean() <= LEAST_STRAIGHT:
+        raise ValueError(
+            f"the law finds no steady driving straight ahead, as at "
+            f"{_first_place(law, middle, is_straight)}: its model is wrong, or "
+            "dataset.law.speed is beyond the vehicle"
+        )
+    if not is_straight.all():
+        place = _first_place(law, middle, is_straight)
+        findings.append(
+            f"at {(~is_straight).sum()} of {is_straight.size} speeds and e ({place}, "
+            "…) the law finds no steady driving straight ahead; that of the nearest "
+            "speed and e is used"
+        )
+        law = _with_nearest_straights(law, is_straight)
+    turns = np.delete(has_turn, middle, axis=0)
+    if not turns.all():
+        curvatures = np.abs(np.delete(_curvatures(law), middle, axis=0))[~turns]
         beyond = int(np.sum(curvatures > tightest))
+        has_turn[middle] = True
         findings.append(
             f"{_share(law, ~has_turn)} no steady turn; the turn of the next smaller "
             f"curvature is used. {beyond} of them ask for more than the steering's "
             f"{tightest:.3g} 1/m, the others for more than the tyres give"
+        )
+    return _with_gains(law, findings)
+
+
+def _with_gains(law: PathLaw, findings: list[str]) -> CheckedLaw:
+    """Return a law with gains at all points.
+
+    Args:
+        law: whose gains may be 0 or not finite.
+        findings: what was found so far.
+
+    Raises:
+        ValueError: at some speed and e there is no gain at any curvature.
+    """
+    gain = np.array(law.gain)
+    finite = np.isfinite(gain).all(axis=(-2, -1))
+    has_gain = np.logical_and(finite, gain.any(axis=(-2, -1)))
+    has_any = np.asarray(has_gain.any(axis=0))
+    if not has_any.all():
+        raise ValueError(
+            f"the law has no gain at any curvature, as at "
+            f"{_first_place(law, len(gain) // 2, has_any)}: its model is wrong there, "
+            "or the weights dataset.law.curvature and lateral do not suit the vehicle"
         )
     if not has_gain.all():
         findings.append(
@@ -104,6 +141,31 @@ def checked_law(law: PathLaw, *, tightest: float) -> CheckedLaw:
         gain = np.take_along_axis(gain, sources[..., None, None], axis=0)
         law = law._replace(gain=jnp.asarray(gain, law.gain.dtype))
     return CheckedLaw(law, tuple(findings))
+
+
+def _with_nearest_straights(
+    law: PathLaw, is_straight: Bool[np.ndarray, "*conditions"]
+) -> PathLaw:
+    """Return a law with the straight of the nearest speed and e, where it lacks one.
+
+    Args:
+        law: of `derive_path_law`.
+        is_straight: whether it found one, at each speed and e.
+    """
+    middle = len(law.control) // 2
+    found = np.argwhere(is_straight)
+    tables = {
+        name: np.array(getattr(law, name)) for name in ("state", "control", "gain")
+    }
+    speeds = np.linspace(law.low[1], law.high[1], law.control.shape[1])
+    for missing in np.argwhere(~is_straight):
+        nearest = found[np.argmin(np.abs(found - missing).sum(axis=1))]
+        for table in tables.values():
+            table[(middle, *missing)] = table[(middle, *nearest)]
+        tables["state"][(middle, *missing)][PATH_SPEED] = speeds[missing[0]]
+    return law._replace(
+        **{name: jnp.asarray(table, law.gain.dtype) for name, table in tables.items()}
+    )
 
 
 def _found_turns(law: PathLaw) -> Bool[np.ndarray, "*axes"]:
@@ -166,16 +228,7 @@ def _place(law: PathLaw, point: tuple[int, ...]) -> str:
     return f"{speed:.3g} m/s, kappa = {sideways / speed**2:.3g} 1/m, e = ({inside})"
 
 
-def _require_anywhere(
-    law: PathLaw, holds: Bool[np.ndarray, "*conditions"], fault: str
-) -> None:
-    """Raise a ValueError with the first speed and e at which something is missing."""
-    if holds.all():
-        return
+def _first_place(law: PathLaw, row: int, holds: Bool[np.ndarray, "*conditions"]) -> str:
+    """Return the first speed and e at which something does not hold, in words."""
     first = np.unravel_index(int(np.argmin(holds)), holds.shape)
-    middle = len(law.control) // 2
-    place = _place(law, (middle, *map(int, first)))
-    raise ValueError(
-        f"the law {fault} at {place}: its model is wrong there, or dataset.law.speed "
-        "or dataset.law.lateral_acceleration are beyond the vehicle"
-    )
+    return _place(law, (row, *map(int, first)))
