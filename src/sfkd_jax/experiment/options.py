@@ -334,7 +334,7 @@ def parse_settings(values: Values) -> Settings:
     # Recorded with the run: whoever loads its policy need not have the simulator.
     if simulator := getattr(vehicle, "env", None):
         stated = described(simulator)
-        vehicle = replace(vehicle, **stated.settings)
+        vehicle = replace(vehicle, **stated.arguments)
         names = environment.names or stated.environment_names
         environment = replace(environment, names=names)
     _check_env_names(environment)

@@ -51,19 +51,18 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
 def error_units(
     model: Model, space: Space, size: float = 1.0
 ) -> Float[Array, " state"]:
-    """Return factors that convert each of `state_errors` to metres, for a car.
+    """Return factors that convert each of `state_errors` to metres.
 
-    See `Frame.lengths` and `Frame.length`. For a vehicle of another size a distance
-    counts as one of a car that is as many lengths of the vehicle. Other errors count as
-    they do for a car.
+    See `Frame.lengths` and `Frame.length`, which are for a system of size 1. A distance
+    counts relative to the size of the system, and other errors as they are.
 
     Args:
         model: in whose frame the errors are.
         space: scales of the model.
-        size: of the vehicle, relative to a car.
+        size: of the system.
     """
     frame = model.frame
-    # Position and distance from a path come before and after the yaw of the pose.
+    # Distances come before and after the yaw of the pose.
     distances = [1.0 / size, 1.0 / size, 1.0]
     if not frame.has_pose:
         distances = [*distances, 1.0 / size, 1.0]
@@ -109,7 +108,7 @@ def multi_step_loss(
         reconstruction: λ_r.
         transport: λ_t, with e' the environment of another window.
         growth: γ.
-        size: of the vehicle, relative to a car with a wheelbase of 2.7 m.
+        size: of the system, see `error_units`.
         tube: λ_i of the first entries of the body state; () for none. It needs a model
             with a contraction rate by construction.
 
@@ -193,7 +192,7 @@ def planning_loss(
         model: with a residual for planners.
         params: of the model; its certified weights are not changed.
         space: scales of the model.
-        size: of the vehicle, relative to a car, see `error_units`.
+        size: of the system, see `error_units`.
     """
     units = error_units(model, space, size) / 0.001
     # The certified weights are frozen, so they are folded once.
@@ -235,7 +234,7 @@ def _window_parts(
         space: scales of the model.
         units: of `state_errors`, see `error_units`.
         growth: γ.
-        size: of the vehicle, relative to a car with a wheelbase of 2.7 m.
+        size: of the system, see `error_units`.
         params: of the model.
         data: the window.
         other: environment of another window.

@@ -111,7 +111,7 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
     # A line before each part of the runs, with the steps of the vehicle in it.
     assert "corridor: part 1 of 16 of the runs, 2,880 steps of the vehicle" in said
     assert any(line.startswith("corridor: part 16 of 16") for line in said)
-    assert "corridor: attack, 6,000 steps of the vehicle" in said
+    assert "corridor: attack, 3,000 steps of the vehicle" in said
     settings = {
         "space": path_space()._asdict(),
         "environment": {"low": BOX["env_low"], "high": BOX["env_high"]},

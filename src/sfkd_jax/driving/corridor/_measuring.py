@@ -102,6 +102,24 @@ class _Progress:
         return driven
 
 
+def _reported_drivers(
+    report: Callable[[str], None],
+    loop: Loop,
+    settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
+) -> tuple[Driver, Driver]:
+    """Return drivers under the conditions and on S3, which say what they drive.
+
+    Args:
+        report: is called with a line before every part of the runs.
+        loop: of the policy.
+        settings: of the drivers, see `drivers_of`.
+    """
+    _, runs, duration, _ = settings
+    progress = _Progress(report, len(DRIVES) * runs * round(duration / loop.plant.dt))
+    drive, drive_s3 = drivers_of(loop, *settings)
+    return progress.reported(drive), progress.reported(drive_s3)
+
+
 def measure_corridor(
     loop: Loop,
     claims: Mapping[str, OutputMetric],
@@ -147,10 +165,8 @@ def measure_corridor(
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    progress = _Progress(report, len(DRIVES) * runs * round(duration / loop.plant.dt))
-    drive, drive_s3 = map(
-        progress.reported, drivers_of(loop, data, runs, duration, dwell)
-    )
+    settings = data, runs, duration, dwell
+    drive, drive_s3 = _reported_drivers(report, loop, settings)
     simulate = jax.jit(partial(simulate_nominal, loop))
     drivers = (drive, drive, drive, drive_s3)
     sensor_keys = jax.random.split(sensor_key, len(drivers))
@@ -167,9 +183,7 @@ def measure_corridor(
     observe = partial(_observed, jax.jit(partial(innovations, loop)))
     observers = (partial(observe, drive), partial(observe, drive_s3))
     alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
-    report(f"corridor: attack, {2 * attack_steps:,} steps of the vehicle")
-    attack = attack_corridor(search, attack_key, bounds.nominal, horizon)
-    settings = data, runs, duration, dwell
+    report(f"corridor: attack, {attack_steps:,} steps of the vehicle")
     late = partial(_late_corridors, loop, later, claims, level, settings)
     return Corridor(
         conditions=_conditions(loop, data, duration, dwell, identified_from),
@@ -183,7 +197,7 @@ def measure_corridor(
         # conditions.
         by_scenario={"s3": corridor_coverage(bounds, s3.scores)},
         seen=test.largest(),
-        attack=attack,
+        attack=attack_corridor(search, attack_key, bounds.nominal, horizon),
         innovations=alarms,
         failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
         shield_horizon=horizon,

@@ -137,19 +137,19 @@ def simulator(make: Make) -> Vehicle:
     Raises:
         ValueError: the simulator cannot be made; gives the reason.
     """
-    return own(**described(make).settings, step=on_host(make))
+    return own(**described(make).arguments, step=on_host(make))
 
 
 class Described(NamedTuple):
     """What a simulator states about its vehicle.
 
     Attributes:
-        settings: of `own`.
+        arguments: of `own`.
         environment_names: names of the entries of e; () if it states none.
         speed: range of the speeds that it is driven at [m/s]; None if it states none.
     """
 
-    settings: dict[str, Any]
+    arguments: dict[str, Any]
     environment_names: tuple[str, ...]
     speed: tuple[float, float] | None
 
@@ -161,15 +161,15 @@ def described(make: Make) -> Described:
         ValueError: the simulator cannot be made, or states no range of speeds; gives
             the reason.
     """
-    settings = dict(pool_of(make).settings)
-    environment_names = settings.pop("environment_names")
-    speed = settings.pop("speed", None)
+    stated = dict(pool_of(make).settings)
+    environment_names = stated.pop("environment_names")
+    speed = stated.pop("speed", None)
     if speed is not None and not (len(speed) == 2 and 0.0 < speed[0] < speed[1]):
         raise ValueError(
             f"vehicle.env={make}: its speed must be two rising numbers above 0 [m/s], "
             f"got {speed}"
         )
-    return Described(settings, environment_names, speed)
+    return Described(stated, environment_names, speed)
 
 
 def on_host(make: Make) -> Step:
