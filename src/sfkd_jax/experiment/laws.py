@@ -47,8 +47,10 @@ law alone. Simulation and split use 0 and 1, runs of S3 use 2.
 """
 NO_EXCITATION = (1e-6, 2e-6)
 """Excitation of the law alone: none, but with a logarithm."""
-TIGHTEST_CIRCLES = 5.0
-"""Curvature of the tightest circles without a law, relative to that of the roads."""
+TIGHTEST_CIRCLES = 0.675
+"""Curvature of the tightest circles without a law, times the wheelbase [-]: 0.25 1/m for
+a car.
+"""
 LOST = 0.4
 """Largest lateral error that counts when laws are compared, in wheelbases: a vehicle
 that leaves its path is lost, however far.
@@ -121,7 +123,10 @@ def derive_law(
 
 
 def _unsettled(simulate: _Simulation, step: Step) -> tuple[int, ...]:
-    """Return the path coordinates that no steady turn fixes, and print their names.
+    """Return the path coordinates that no steady turn fixes.
+
+    Those of the vehicle are printed. In the textbook's model further states are
+    constant, which is no finding.
 
     Args:
         simulate: what the law is for.
@@ -129,8 +134,8 @@ def _unsettled(simulate: _Simulation, step: Step) -> tuple[int, ...]:
     """
     plant = simulate.plant
     drives = simulate.drives
-    # A learned model has no zeros, so the vehicle is asked, if there is one.
-    asked = plant.step if plant.simulated else step
+    # A learned model has no zeros, so the vehicle is asked.
+    asked = plant.step if drives.law.model == "learned" else step
     low, high = (np.asarray(end, float) for end in simulate.box.values())
     found = unsettled_coordinates(
         asked,
@@ -138,7 +143,7 @@ def _unsettled(simulate: _Simulation, step: Step) -> tuple[int, ...]:
         speed=float(np.mean(drives.law.speed)),
         env=tuple((0.5 * (low + high)).tolist()),
     )
-    if found:
+    if found and asked is plant.step:
         names = ", ".join(plant.state_names[coordinate + 1] for coordinate in found)
         store.print_message(
             f"vehicle {plant.name}: {names} never settle, so no steady turn fixes "
@@ -179,8 +184,7 @@ def _step_of_model(simulate: _Simulation, name: str) -> Step:
 def _learned_step(simulate: _Simulation) -> Step:
     """Return the step of a regression of runs without a law, over the law's axes."""
     plant = simulate.plant
-    drives: Any = simulate.drives
-    law = drives.law
+    law = simulate.drives.law
     box = simulate.box
     seed = simulate.key(OPEN_LOOP_STREAM)
     run_key, split_key, start_key, fit_key = jax.random.split(seed, 4)
@@ -192,7 +196,7 @@ def _learned_step(simulate: _Simulation) -> Step:
         plant,
         speed=(0.8 * slowest, 1.1 * fastest),
         lateral_acceleration=1.2 * law.lateral_acceleration,
-        tightest=TIGHTEST_CIRCLES * drives.peak_curvature,
+        tightest=TIGHTEST_CIRCLES / plant.wheelbase,
         **box,
     )
     driven = jax.jit(drive)(run_key)
