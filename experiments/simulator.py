@@ -1,8 +1,9 @@
-"""What experiments/simulator.sh found, as one line of JSON.
+"""What experiments/simulator.sh and slipx.sh found, as one line of JSON.
 
-    python -m experiments.simulator ROOT
+    python -m experiments.simulator ROOT NAME
 
-ROOT is the folder of the runs. The script calls this at its end.
+ROOT is the folder of the runs, and NAME what their names begin with. The scripts call
+this at their end.
 """
 
 import json
@@ -23,11 +24,14 @@ PREFIXES = {
 """System -> beginning of the names of its numbers; those of the policy have none, and
 "estimated_" where it estimates the environment.
 """
+ROWS = PREFIXES | {"law": "law_"}
+"""The same, with the law of the policy alone, which not every script drives."""
 
 
 def main():
     """Print the line."""
-    runs = sorted(Path(sys.argv[1]).glob("highway*/*/*/"))
+    root, name = sys.argv[1:]
+    runs = sorted(Path(root).glob(f"{name}*/*/*/"))
     claimed = certificate.read(runs[0] / "certificate.json", DrivingCertificate)
     corridor = claimed.corridor
     found = {
@@ -40,11 +44,11 @@ def main():
     for run in runs:
         for row in json.loads((run / "results.json").read_text("utf-8"))["rows"]:
             estimated = row["env"] == "estimated"
-            name = "estimated_" if estimated else PREFIXES.get(row["system"], "")
+            name = "estimated_" if estimated else ROWS.get(row["system"], "")
             found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
             found[f"{name}departures"] = row["departures"]
     rounded = {name: np.round(value, 3).tolist() for name, value in found.items()}
-    law = {"law": corridor["conditions"]["law_model"]}
+    law = {"law": corridor.conditions.law_model}
     print(json.dumps(law | rounded | stamp()))
 
 

@@ -26,7 +26,7 @@ for word in "$@"; do
 done
 car=(
   vehicle=simulator vehicle.env=highway:make
-  'environment.low=[0.35,-3]' 'environment.high=[1,3]'
+  'environment.low=[0.35,-3]' 'environment.high=[1,3]' scaled=false
   "${size[@]}"
 )
 path=(
@@ -43,4 +43,4 @@ python -m sfkd_jax.evaluate "${path[@]}" 'evaluation.systems=[self]' environment
 python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 \
   'evaluation.systems=[law_stanley,law_pure_pursuit]' "$@"
 python -m sfkd_jax.evaluate +experiment=s3_body name=highway_nominal "${car[@]}" 'evaluation.systems=[nominal]' "$@"
-python -m experiments.simulator "$root"
+python -m experiments.simulator "$root" highway

@@ -25,7 +25,7 @@ def composed(*overrides):
 
 def settings(*overrides):
     """The checked settings."""
-    return command.settings_of(composed(*overrides))
+    return command.settings_of(composed(*overrides), overrides)
 
 
 def run(*overrides):

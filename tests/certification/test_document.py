@@ -55,6 +55,20 @@ def test_what_ships_is_verified_and_is_written_as_it_was_read(name, tmp_path):
     assert read(tmp_path / "again.json", DrivingCertificate) == honest
 
 
+def test_what_could_not_be_read_again_is_not_written(tmp_path):
+    path = policy.SHIPPED / "kinematic_path" / "certificate.json"
+    certificate = read(path, DrivingCertificate)
+    unusable = {
+        "alpha": replace(certificate.proof, alpha=float("nan")),
+        "lipschitz": replace(certificate.proof, lipschitz={"yaw": float("inf")}),
+    }
+    for name, proof in unusable.items():
+        with pytest.raises(ValueError, match=name) as refused:
+            write(tmp_path / "certificate.json", replace(certificate, proof=proof))
+        assert "\n" not in str(refused.value)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_document_has_the_entries_of_the_class_that_it_is_read_as():
     driving = document("kinematic")
     general = hashed({name: driving[name] for name in driving if name != "corridor"})

@@ -166,7 +166,10 @@ def space_from_settings(settings: Values) -> Space:
     return Space(*jax.device_put(arrays))
 
 
-@takes(path_following.derive_path_law, skip=("coordinates", "env_low", "env_high"))
+@takes(
+    path_following.derive_path_law,
+    skip=("coordinates", "env_low", "env_high", "unsettled"),
+)
 class LawSettings:
     """The law of path coordinates, as arguments of `derive_path_law`.
 

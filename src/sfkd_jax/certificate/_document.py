@@ -97,6 +97,7 @@ def write(
 
     Raises:
         ArtefactError: the disk refuses, or the file of the key holds none.
+        ValueError: the certificate could not be read again; names the entry.
     """
     entries = store.plain(_entries(certificate))
     kept = {name: entries.pop(name, None) for name in UNHASHED}
@@ -112,7 +113,10 @@ def write(
     signature = kept["signature"] if kept["sha256"] == digest else None
     if signing_key is not None:
         signature = asdict(_signature.sign(digest, signing_key))
-    store.write_json(path, {**document, "sha256": digest, "signature": signature})
+    document = {**document, "sha256": digest, "signature": signature}
+    # Here and not after hours, where somebody loads it.
+    parse(store.plain(document), type(certificate))
+    store.write_json(path, document)
 
 
 def read(path: Path, kind: type[C]) -> C | Refusal:

@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -29,6 +29,7 @@ from sfkd_jax.experiment.identified import with_identified
 from sfkd_jax.experiment.options import Settings, parse_settings
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.experiment.run_directory import IDENTITY
+from sfkd_jax.experiment.scaling import scaled, summary
 from sfkd_jax.experiment.schemas import register
 from sfkd_jax.settings import replace
 from sfkd_jax.store import ArtefactError, print_message
@@ -58,7 +59,9 @@ def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None
     def main(composed: DictConfig) -> Any:
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         try:
-            settings = named_for_controller(settings_of(composed))
+            settings = named_for_controller(settings_of(composed, _typed()))
+            if derived := summary(settings):
+                print_message(derived)
             if sweeping:
                 settings = named_for_sweep(settings)
             use_compilation_cache(Path(settings.root))
@@ -161,10 +164,15 @@ def conf_path() -> str:
     return str(installed if installed.exists() else checkout)
 
 
-def settings_of(composed: DictConfig) -> Settings:
-    """Return composed options as checked settings."""
+def settings_of(composed: DictConfig, words: Collection[str] = ()) -> Settings:
+    """Return composed options as checked settings, scaled to the vehicle.
+
+    Args:
+        composed: by Hydra.
+        words: the overrides that it was composed with.
+    """
     values: Any = OmegaConf.to_container(composed, resolve=True)
-    return parse_settings(values)
+    return scaled(parse_settings(values), words)
 
 
 def _typed() -> list[str]:
@@ -177,8 +185,9 @@ def _typed() -> list[str]:
 
 def compose(*overrides: str) -> Settings:
     """Return the settings of the running command under further overrides."""
-    composed = hydra.compose("config", [*_typed(), *overrides])
-    return with_identified(settings_of(composed))
+    words = [*_typed(), *overrides]
+    composed = hydra.compose("config", words)
+    return with_identified(settings_of(composed, words))
 
 
 def command_line(name: str) -> str:

@@ -126,7 +126,7 @@ def _fit_planning(
     store.print_message("training what planners add to its steps")
     return descend(
         params["planning"],
-        planning_loss(model, params, space),
+        planning_loss(model, params, space, training.loss.size),
         partial(random_windows, batch=PLANNING_BATCH, length=1),
         dataset.train,
         key,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,12 +17,20 @@ from sfkd_jax import models, store
 from sfkd_jax.assembly import LOGGED
 from sfkd_jax.data import split
 from sfkd_jax.driving.drives import generate_along_path, generate_open_loop
+from sfkd_jax.driving.path_coordinates import (
+    CURVATURE,
+    LATERAL,
+    REFERENCE_SPEED,
+    is_valid,
+)
 from sfkd_jax.driving.path_following import (
     TEXTBOOK,
     PathLaw,
+    checked_law,
     derive_path_law,
     law_from_arrays,
     textbook_law,
+    unsettled_coordinates,
 )
 from sfkd_jax.driving.plants import Vehicle, along_path
 from sfkd_jax.experiment import identified
@@ -38,13 +47,23 @@ law alone. Simulation and split use 0 and 1, runs of S3 use 2.
 """
 NO_EXCITATION = (1e-6, 2e-6)
 """Excitation of the law alone: none, but with a logarithm."""
-LOST_M = 1.0
-"""Largest lateral error that counts when laws are compared [m]."""
+TIGHTEST_CIRCLES = 0.675
+"""Curvature of the tightest circles without a law, times the wheelbase [-]: 0.25 1/m for
+a car.
+"""
+LOST = 0.4
+"""Largest lateral error that counts when laws are compared, in wheelbases: a vehicle
+that leaves its path is lost, however far.
+"""
 LARGEST_RATIO = 1.5
-"""A law is accepted if its lateral error is at most this times what its model promises,
-and `SLACK_MM`.
+"""A law of a learned model is accepted if its lateral error is at most this times what
+its model promises, and `SLACK_MM`.
 """
 SLACK_MM = 5.0
+LARGEST_ERROR = 0.1
+"""A law is accepted if its lateral error is at most this [wheelbases, RMS]."""
+LARGEST_SHARE_DROPPED = 0.1
+"""Share of the runs that a simulator may fail in."""
 
 
 def write(path: Path, law: PathLaw, config: dict[str, Any]) -> None:
@@ -87,16 +106,50 @@ def derive_law(
         derive_path_law,
         step,
         coordinates=len(plant.state_names) - 1,
+        unsettled=_unsettled(simulate, step),
         **{corner: tuple(map(float, ends)) for corner, ends in box.items()},
         **arguments(drives.law, derive_path_law),
     )
     law = jax.jit(derive)()
+    steering = min(abs(plant.control_low[0]), abs(plant.control_high[0]))
+    tightest = math.tan(min(steering, 1.5)) / plant.wheelbase
+    law, findings = checked_law(law, tightest=tightest)
+    for finding in findings:
+        store.print_message(f"vehicle {plant.name}: {finding}")
     if name in TEXTBOOK:
         return _best_textbook_law(simulate, law, name)
-    # Beside itself a model of logs would find nothing.
-    if name != "plant" and step is not plant.step:
-        _check_law(simulate, law, step)
+    _check_law(simulate, law, step)
     return law
+
+
+def _unsettled(simulate: _Simulation, step: Step) -> tuple[int, ...]:
+    """Return the path coordinates that no steady turn fixes.
+
+    Those of the vehicle are printed. In the textbook's model further states are
+    constant, which is no finding.
+
+    Args:
+        simulate: what the law is for.
+        step: of the model that the law is derived from.
+    """
+    plant = simulate.plant
+    drives = simulate.drives
+    # A learned model has no zeros, so the vehicle is asked.
+    asked = plant.step if drives.law.model == "learned" else step
+    low, high = (np.asarray(end, float) for end in simulate.box.values())
+    found = unsettled_coordinates(
+        asked,
+        coordinates=len(plant.state_names) - 1,
+        speed=float(np.mean(drives.law.speed)),
+        env=tuple((0.5 * (low + high)).tolist()),
+    )
+    if found and asked is plant.step:
+        names = ", ".join(plant.state_names[coordinate + 1] for coordinate in found)
+        store.print_message(
+            f"vehicle {plant.name}: {names} never settle, so no steady turn fixes "
+            "them; leave them out of state_names if no other state depends on them"
+        )
+    return found
 
 
 class _Simulation(NamedTuple):
@@ -143,6 +196,7 @@ def _learned_step(simulate: _Simulation) -> Step:
         plant,
         speed=(0.8 * slowest, 1.1 * fastest),
         lateral_acceleration=1.2 * law.lateral_acceleration,
+        tightest=TIGHTEST_CIRCLES / plant.wheelbase,
         **box,
     )
     driven = jax.jit(drive)(run_key)
@@ -181,24 +235,46 @@ def _best_textbook_law(simulate: _Simulation, law: PathLaw, name: str) -> PathLa
 def _check_law(simulate: _Simulation, law: PathLaw, step: Step) -> None:
     """Drive the vehicle by the law alone, beside the model that it was derived from.
 
-    Where the vehicle strays much farther than the model, the model is not that of the
-    vehicle: a learned one is refused, the textbook's is what the settings ask for.
+    Where the vehicle strays much farther than a learned model, the model was fitted
+    badly. Where both stray far, the law does not suit the vehicle. The law of the
+    textbook's model is what the settings ask for, however far it strays.
+
+    Raises:
+        ValueError: the vehicle strays too far; says which of the two it is.
     """
     plant = simulate.plant
     name = simulate.drives.law.model
     error = _lateral_error(simulate, plant.step)(law)
-    promised = _lateral_error(simulate, step)(law)
     line = (
         f"the law of the {name} model keeps vehicle {plant.name} within {error:.1f} mm "
-        f"(RMS) of its paths, the model promises {promised:.1f} mm"
+        "(RMS) of its paths"
     )
+    promised = error
+    # Beside itself a plant, or a model of logs, would find nothing.
+    if step is not plant.step:
+        promised = _lateral_error(simulate, step)(law)
+        line = f"{line}, the model promises {promised:.1f} mm"
+    store.print_message(line)
+    if name == "nominal":
+        return
     # Not `>`: NaN is no law.
-    if not error <= LARGEST_RATIO * promised + SLACK_MM and name == "learned":
+    if not error <= LARGEST_RATIO * promised + SLACK_MM:
         raise ValueError(
-            f"{line}: it was fitted badly; narrow dataset.law.speed or "
+            f"{line}: the model was fitted badly; narrow dataset.law.speed or "
             "dataset.law.lateral_acceleration, or pass dataset.law.model=plant"
         )
-    store.print_message(line)
+    largest = 1e3 * LARGEST_ERROR * plant.wheelbase
+    if error <= largest:
+        return
+    cause = (
+        "the weights dataset.law.curvature, lateral and heading do not suit the "
+        "vehicle, or its roads need more than tyres and steering give"
+    )
+    if step is not plant.step:
+        cause = f"its model is rough (dataset.law.model=plant has none), or {cause}"
+    raise ValueError(
+        f"{line}, more than {largest:.0f} mm, a tenth of its wheelbase: {cause}"
+    )
 
 
 def _lateral_error(simulate: _Simulation, step: Step) -> Callable[[PathLaw], float]:
@@ -223,16 +299,20 @@ def _lateral_error(simulate: _Simulation, step: Step) -> Callable[[PathLaw], flo
 
     def lateral_error(law: PathLaw) -> float:
         (runs,) = without_faults(drive(law), simulator=simulate.simulator)
-        # A vehicle that leaves its path is lost, however far.
-        lateral = jnp.clip(runs.states[..., BODY.start], -LOST_M, LOST_M)
-        error = 1e3 * float(jnp.sqrt(jnp.mean(lateral**2)))
-        return error if np.isfinite(error) else np.inf
+        lateral = np.abs(np.asarray(runs.states, float)[..., BODY.start + LATERAL])
+        lost = LOST * simulate.plant.wheelbase
+        # NaN is far from the path, too.
+        lateral = np.where(lateral <= lost, lateral, lost)
+        return 1e3 * float(np.sqrt(np.mean(lateral**2)))
 
     return lateral_error
 
 
 def without_faults(runs: Trajectory, *labels: Any, simulator: bool) -> Any:
     """Drop the runs in which a simulator failed, and print how many they are.
+
+    A run that has left its path before it is not finite is no failure of the simulator,
+    and is kept: path coordinates are not meaningful there.
 
     Args:
         runs: simulated, (run, …).
@@ -244,15 +324,31 @@ def without_faults(runs: Trajectory, *labels: Any, simulator: bool) -> Any:
         (runs, *labels) without the runs that failed.
 
     Raises:
-        ValueError: the simulator failed in every run.
+        ValueError: the simulator failed in more than `LARGEST_SHARE_DROPPED` of them.
     """
-    states = np.asarray(runs.states)
-    kept = np.flatnonzero(np.isfinite(states).all(axis=(1, 2)))
-    num_failed = len(states) - len(kept)
-    if not num_failed or not simulator:
+    finite = np.isfinite(np.asarray(runs.states)).all(axis=(1, 2))
+    failed = ~finite & ~_left_path(runs)
+    if not simulator or not failed.any():
         return runs, *labels
-    failed = f"the simulator failed in {num_failed} of {len(states)} runs"
-    if not len(kept):
-        raise ValueError(f"{failed}; the warnings above say how")
-    store.print_message(f"{failed}, which are dropped")
+    line = f"the simulator failed in {failed.sum()} of {len(failed)} runs"
+    if failed.mean() > LARGEST_SHARE_DROPPED:
+        raise ValueError(
+            f"{line}, and no more than {LARGEST_SHARE_DROPPED:.0%} may be dropped; the "
+            "warnings above say how it failed"
+        )
+    store.print_message(f"{line}, which are dropped; the warnings above say how")
+    kept = np.flatnonzero(~failed)
     return jax.tree.map(lambda leaf: leaf[kept], (runs, *labels))
+
+
+def _left_path(runs: Trajectory) -> np.ndarray:
+    """Return which runs were where path coordinates are not meaningful.
+
+    No run was, if the runs are not in path coordinates.
+    """
+    controls = jnp.asarray(runs.controls)
+    if controls.shape[-1] <= REFERENCE_SPEED:
+        return np.zeros(len(controls), bool)
+    lateral = jnp.asarray(runs.states)[:, :-1, BODY.start + LATERAL]
+    beyond = ~is_valid(lateral, controls[..., CURVATURE])
+    return np.asarray(jnp.any(jnp.isfinite(lateral) & beyond, axis=1))

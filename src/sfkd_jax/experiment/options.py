@@ -307,6 +307,7 @@ class Settings:
     name: Directory
     root: str
     optimized: bool
+    scaled: bool
     vehicle: VehicleSettings
     environment: EnvironmentSettings
     scenario: ScenarioSettings
@@ -332,9 +333,10 @@ def parse_settings(values: Values) -> Settings:
     vehicle = settings.vehicle
     # Recorded with the run: whoever loads its policy need not have the simulator.
     if simulator := getattr(vehicle, "env", None):
-        properties, env_names = described(simulator)
-        vehicle = replace(vehicle, **properties)
-        environment = replace(environment, names=environment.names or env_names)
+        stated = described(simulator)
+        vehicle = replace(vehicle, **stated.arguments)
+        names = environment.names or stated.environment_names
+        environment = replace(environment, names=names)
     _check_env_names(environment)
     return replace(
         settings,

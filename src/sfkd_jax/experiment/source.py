@@ -14,7 +14,7 @@ from sfkd_jax import assembly, store
 from sfkd_jax.assembly import VehicleSettings
 from sfkd_jax.data import Dataset
 from sfkd_jax.driving.path_following import PathLaw
-from sfkd_jax.driving.plants import Vehicle, check_step
+from sfkd_jax.driving.plants import Vehicle, check_step, hidden_change
 from sfkd_jax.experiment import data, dataset_files, identified, laws
 from sfkd_jax.experiment.options import (
     AlongPathSettings,
@@ -156,6 +156,7 @@ class DataSource:
         """Return a new data set; what was found of logs is written beside it."""
         if self.logs is None:
             self.check_plant()
+            self._report_hidden_states()
             return data.simulate(
                 self._drive(),
                 self.settings,
@@ -167,6 +168,22 @@ class DataSource:
         lags = {name: lag._asdict() for name, lag in logged.command_lags.items()}
         store.write_json(self.path.with_name(COMMAND_LAGS), lags)
         return logged.dataset
+
+    def _report_hidden_states(self) -> None:
+        """Print which states of a simulator go wrong because it has others."""
+        settings: Any = self.settings
+        if not self.has_simulator or self.environment.low is None:
+            return
+        vehicle: Any = self.vehicle
+        found = hidden_change(vehicle.env, self.plant, speed=settings.speed, **self.box)
+        if not found:
+            return
+        listed = ", ".join(f"{name} by {value:.3g}" for name, value in found.items())
+        store.print_message(
+            f"simulator {vehicle.env}: two steps from one reset differ from two resets "
+            f"in {listed} (RMS): it has states that state_names does not name. They "
+            "start anew at every step, so another vehicle is learned and certified"
+        )
 
     def _drive(self, *, switching: bool = False, **changes: int) -> data.Drive:
         """Return key -> runs of the vehicle or of its closed loop, see `data.drive`."""

@@ -151,7 +151,13 @@ def certify_policy(run: Run) -> DrivingCertificate | Refusal:
     seconds = time.perf_counter() - began
     provenance = dataclasses.replace(certificate.provenance, seconds=seconds)
     certificate = dataclasses.replace(certificate, provenance=provenance)
-    write(run.certificate_path, certificate, signing_key=settings.signing_key)
+    key = settings.signing_key
+    try:
+        write(run.certificate_path, certificate, signing_key=key)
+    except ValueError as reason:
+        unreadable = f"what was measured is no certificate: {reason}"
+        certificate = Refusal(reason=unreadable, provenance=provenance)
+        write(run.certificate_path, certificate, signing_key=key)
     store.print_message(f"certificate: {_verdict(certificate, settings)}")
     if not isinstance(certificate, Refusal) and certificate.proof.lyapunov_refused:
         store.print_message(f"certificate: {certificate.proof.lyapunov_refused}")
@@ -254,6 +260,7 @@ def _measure_corridor(run: Run, trained: policy.TrainedModel, proof: Proof) -> C
         proof.outputs,
         {**store.plain(settings.dataset), **run.source.box},
         settings.certification.level,
+        store.print_message,
         identified_from=getattr(settings.vehicle, "contents", None),
         **arguments(settings.certification.corridor, measure_corridor),
     )

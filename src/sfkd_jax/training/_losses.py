@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.ranges import Numbers
+from sfkd_jax.ranges import Numbers, Positive
 from sfkd_jax.rollout import Folded, fold, rollout, state_errors
 from sfkd_jax.types import BODY, Environment, Model, Params, Scalar, Space, Trajectory
 
@@ -48,13 +48,25 @@ def power_mean(values: Float[Array, "*shape"], power: int = 8) -> Scalar:
     return largest * jnp.mean((values / largest) ** power) ** (1.0 / power)
 
 
-def error_units(model: Model, space: Space) -> Float[Array, " state"]:
+def error_units(
+    model: Model, space: Space, size: float = 1.0
+) -> Float[Array, " state"]:
     """Return factors that convert each of `state_errors` to metres.
 
-    See `Frame.lengths` and `Frame.length`.
+    See `Frame.lengths` and `Frame.length`, which are for a system of size 1. A distance
+    counts relative to the size of the system, and other errors as they are.
+
+    Args:
+        model: in whose frame the errors are.
+        space: scales of the model.
+        size: of the system.
     """
     frame = model.frame
-    first = jnp.asarray(frame.lengths)
+    # Distances come before and after the yaw of the pose.
+    distances = [1.0 / size, 1.0 / size, 1.0]
+    if not frame.has_pose:
+        distances = [*distances, 1.0 / size, 1.0]
+    first = jnp.asarray(frame.lengths) * jnp.asarray(distances)
     units = frame.length / jnp.asarray(space.body_scale)
     return jnp.concatenate([first, units[len(first) - BODY.start :]])
 
@@ -69,6 +81,7 @@ def multi_step_loss(
     reconstruction: float = 0.1,
     transport: float = 0.1,
     growth: float = GROWTH,
+    size: Positive = 1.0,
     tube: Numbers = (),
 ) -> Loss:
     """Return the mean prediction error over windows and steps, plus four regularisers.
@@ -95,6 +108,7 @@ def multi_step_loss(
         reconstruction: λ_r.
         transport: λ_t, with e' the environment of another window.
         growth: γ.
+        size: of the system, see `error_units`.
         tube: λ_i of the first entries of the body state; () for none. It needs a model
             with a contraction rate by construction.
 
@@ -112,7 +126,7 @@ def multi_step_loss(
             f"training.loss.tube has {len(tube)} weights, "
             f"the body state {space.body_mean.shape[0]} entries"
         )
-    units = error_units(model, space)
+    units = error_units(model, space, size)
     weights = {
         "prediction": prediction,
         "one_step": one_step,
@@ -166,13 +180,21 @@ def one_step_loss(model: Model) -> Loss:
     return _mean_of(error)
 
 
-def planning_loss(model: Model, params: Params, space: Space) -> Loss:
+def planning_loss(
+    model: Model, params: Params, space: Space, size: float = 1.0
+) -> Loss:
     """Return the mean square error of single steps of `model.planning` [mm²].
 
     The parameters of the loss are the weights of the residual alone. A rollout of
     states is right where its steps are.
+
+    Args:
+        model: with a residual for planners.
+        params: of the model; its certified weights are not changed.
+        space: scales of the model.
+        size: of the system, see `error_units`.
     """
-    units = error_units(model, space) / 0.001
+    units = error_units(model, space, size) / 0.001
     # The certified weights are frozen, so they are folded once.
     frozen = fold(model, params)
     planning = model if model.planning is None else model.planning
@@ -212,6 +234,7 @@ def _window_parts(
         space: scales of the model.
         units: of `state_errors`, see `error_units`.
         growth: γ.
+        size: of the system, see `error_units`.
         params: of the model.
         data: the window.
         other: environment of another window.

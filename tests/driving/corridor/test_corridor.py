@@ -106,7 +106,12 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
         level=0.9,
     )
     small = {"runs": 24, "duration": 4.0, "attack_steps": 3000, "later": (0.1,)}
-    corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, **small)
+    said = []
+    corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, said.append, **small)
+    # A line before each part of the runs, with the steps of the vehicle in it.
+    assert "corridor: part 1 of 16 of the runs, 2,880 steps of the vehicle" in said
+    assert any(line.startswith("corridor: part 16 of 16") for line in said)
+    assert "corridor: attack, 3,000 steps of the vehicle" in said
     settings = {
         "space": path_space()._asdict(),
         "environment": {"low": BOX["env_low"], "high": BOX["env_high"]},

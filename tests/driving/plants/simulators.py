@@ -48,6 +48,54 @@ class Faulty:
         return self.state
 
 
+class Small:
+    """A car at a tenth, which turns without slip and counts what never settles."""
+
+    state_names = ("p_x", "p_y", "yaw", "v", "odometer", "charge", "clock")
+    control_low, control_high = (-0.4, -2.0), (0.4, 2.0)
+    dt, wheelbase, speed, workers = 0.1, 0.27, (0.5, 3.0), 1
+
+    def reset(self, state):
+        self.state = state
+
+    def step(self, control, environment):
+        x, y, yaw, v, odometer, charge, clock = self.state
+        way = v * self.dt
+        turned = way * np.tan(control[0]) / self.wheelbase
+        self.state = np.array(
+            [
+                x + way * np.cos(yaw + 0.5 * turned),
+                y + way * np.sin(yaw + 0.5 * turned),
+                yaw + turned,
+                v + self.dt * control[1],
+                odometer + way,
+                charge - 1e-6,
+                clock + self.dt,
+            ]
+        )
+        return self.state
+
+
+class Forgetful(Small):
+    """The same with a servo that its names leave out."""
+
+    state_names = Small.state_names[:4]
+
+    def reset(self, state):
+        self.state = np.append(state, np.zeros(3))
+        self.steering = 0.0
+
+    def step(self, control, environment):
+        self.steering += 0.5 * (control[0] - self.steering)
+        return super().step([self.steering, control[1]], environment)[:4]
+
+
+class Backwards(Small):
+    """The same with a range of speeds that is none."""
+
+    speed = (3.0, 0.5)
+
+
 class Gym(gymnasium.Env):
     """The same as an environment of gymnasium."""
 

@@ -74,6 +74,29 @@ def test_what_a_simulator_does_wrong_ends_that_run_alone_and_is_said_once(car):
     ).all()
 
 
+def test_states_that_a_simulator_does_not_name_are_noticed():
+    """Two steps from one reset against two resets."""
+    box = {"speed": (0.5, 3.0), "env_low": (0.0,), "env_high": (1.0,)}
+    for name in ("Small", "Faulty"):
+        make = f"{HERE}:{name}"
+        vehicle = plants.simulator(make)
+        assert plants.hidden_change(make, vehicle, **box | {"env_high": (0.0,)}) == {}
+    make = f"{HERE}:Forgetful"
+    found = plants.hidden_change(make, plants.simulator(make), **box)
+    # The servo lags by half; x and v do not depend on it.
+    assert set(found) == {"p_y", "yaw"}
+    assert found["yaw"] > 0.01
+    failing = {**box, "env_low": (2.0,), "env_high": (2.0,)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert plants.hidden_change(f"{HERE}:Faulty", vehicle, **failing) == {}
+
+
+def test_a_range_of_speeds_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="its speed must be two rising numbers"):
+        plants.simulator(f"{HERE}:Backwards")
+
+
 def test_an_environment_of_gymnasium_starts_at_every_state():
     plant = plants.simulator(f"{HERE}:wrapped")
     state, control, env = (leaf[0] for leaf in rows([0]))

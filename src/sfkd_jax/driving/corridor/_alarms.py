@@ -41,6 +41,12 @@ MARGIN = 1.25
 """Factor on thresholds. The tail of real runs is somewhat heavier than the exponential
 that the thresholds are computed from.
 """
+SMALLEST_DEVIATION = 1e-6
+"""Smallest standard deviation of an innovation: what float32 rounds. A state that a
+model predicts exactly has none.
+"""
+LARGEST_THRESHOLD = 1e6
+"""Largest threshold. None that a run without end would ask for is reached."""
 SECONDS_PER_ALARM = 86_400.0
 """Time of driving in which one false alarm is accepted, a day [s]."""
 Observed: TypeAlias = tuple[Float[Array, "run gap chart"], Float[Array, "run gap"]]
@@ -158,7 +164,11 @@ def calibrate_innovations(
     maxima = np.concatenate([*map(largest, batches)], dtype=np.float64)
     reference, scores = np.array_split(maxima, 2)
     rate = duration / SECONDS_PER_ALARM
-    thresholds = MARGIN * alarm_thresholds(reference, scores, rate=rate)
+    with np.errstate(all="ignore"):
+        thresholds = MARGIN * alarm_thresholds(reference, scores, rate=rate)
+    # A run that diverged has no finite maximum, and a threshold of NaN is no threshold.
+    thresholds = np.nan_to_num(thresholds, nan=np.inf, posinf=np.inf)
+    thresholds = np.minimum(thresholds, LARGEST_THRESHOLD)
     test_maxima = largest(observe(test_key))
     s3_maxima = largest(observe_s3(s3_key))
     return Innovations(
@@ -189,4 +199,7 @@ def _deviations_by_level(
     # `nanmean`, because an innovation is NaN where the steering is in no steady turn of
     # the law.
     deviations = [np.sqrt(np.nanmean(steps[group] ** 2, axis=0)) for group in groups]
-    return np.asarray(means), np.stack(deviations)
+    found = np.stack(deviations)
+    # Nothing is known of a chart that had no finite innovation.
+    known = np.where(np.isfinite(found), found, 1.0)
+    return np.asarray(means), np.maximum(known, SMALLEST_DEVIATION)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -33,6 +33,7 @@ from sfkd_jax.driving.certificate import (
     RecordedConditions,
 )
 from sfkd_jax.driving.corridor._alarms import (
+    BATCHES,
     calibrate_innovations,
     innovations,
     simulate_nominal,
@@ -57,7 +58,7 @@ from sfkd_jax.driving.drives import Reading
 from sfkd_jax.driving.scenarios import DRIVES
 from sfkd_jax.latency import Delays
 from sfkd_jax.ranges import Interval, Span
-from sfkd_jax.types import Key
+from sfkd_jax.types import Key, Trajectory
 
 STREAM = 4
 """Number that is folded into the data set's seed for the corridor. The data set itself
@@ -69,11 +70,62 @@ LATE_STREAM = 6
 """The same for the corridors of vehicles that are later than stated."""
 
 
+PARTS = 4 + 2 + BATCHES
+"""Parts of the runs: for units, bounds, coverage and S3, and those of the alarms."""
+
+
+@dataclass
+class _Progress:
+    """What is said before every part of the runs.
+
+    Attributes:
+        report: is called with a line.
+        steps: of the vehicle in a part.
+        begun: number of parts that were begun.
+    """
+
+    report: Callable[[str], None]
+    steps: int
+    begun: int = 0
+
+    def reported(self, driver: Driver) -> Driver:
+        """Return a driver that says which part it drives."""
+
+        def driven(key: Key) -> tuple[Trajectory, Reading | None]:
+            self.begun += 1
+            self.report(
+                f"corridor: part {self.begun} of {PARTS} of the runs, "
+                f"{self.steps:,} steps of the vehicle"
+            )
+            return driver(key)
+
+        return driven
+
+
+def _reported_drivers(
+    report: Callable[[str], None],
+    loop: Loop,
+    settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
+) -> tuple[Driver, Driver]:
+    """Return drivers under the conditions and on S3, which say what they drive.
+
+    Args:
+        report: is called with a line before every part of the runs.
+        loop: of the policy.
+        settings: of the drivers, see `drivers_of`.
+    """
+    _, runs, duration, _ = settings
+    progress = _Progress(report, len(DRIVES) * runs * round(duration / loop.plant.dt))
+    drive, drive_s3 = drivers_of(loop, *settings)
+    return progress.reported(drive), progress.reported(drive_s3)
+
+
 def measure_corridor(
     loop: Loop,
     claims: Mapping[str, OutputMetric],
     data: Mapping[str, Any],
     level: float,
+    report: Callable[[str], None],
     *,
     runs: int = 150,
     duration: Annotated[float, Interval("(2, inf)")] = 60.0,
@@ -95,6 +147,7 @@ def measure_corridor(
         data: settings of the data set: `ROAD_SETTINGS`, `EXCITATION`, env_low,
             env_high, seed and law.
         level: 1 − δ.
+        report: is called with a line before every part of the work.
         runs: number of runs of each part.
         duration: of a run [s].
         dwell: range of times between switches [s].
@@ -112,7 +165,8 @@ def measure_corridor(
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    drive, drive_s3 = drivers_of(loop, data, runs, duration, dwell)
+    settings = data, runs, duration, dwell
+    drive, drive_s3 = _reported_drivers(report, loop, settings)
     simulate = jax.jit(partial(simulate_nominal, loop))
     drivers = (drive, drive, drive, drive_s3)
     sensor_keys = jax.random.split(sensor_key, len(drivers))
@@ -129,7 +183,7 @@ def measure_corridor(
     observe = partial(_observed, jax.jit(partial(innovations, loop)))
     observers = (partial(observe, drive), partial(observe, drive_s3))
     alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
-    settings = data, runs, duration, dwell
+    report(f"corridor: attack, {attack_steps:,} steps of the vehicle")
     late = partial(_late_corridors, loop, later, claims, level, settings)
     return Corridor(
         conditions=_conditions(loop, data, duration, dwell, identified_from),

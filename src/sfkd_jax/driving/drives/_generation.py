@@ -198,6 +198,7 @@ def generate_open_loop(
     *,
     speed: Span,
     lateral_acceleration: Positive,
+    tightest: Positive = 0.25,
     segments: int = 4000,
     steps: int = 50,
     env_low: tuple[float, ...],
@@ -212,8 +213,8 @@ def generate_open_loop(
         vehicle: the plant.
         key: consumed.
         speed: range of the speeds [m/s].
-        lateral_acceleration: of the tightest circles [m/s²], which are never tighter
-            than 0.25 /m.
+        lateral_acceleration: of the tightest circles [m/s²].
+        tightest: largest curvature of a circle [1/m].
         segments: number of them.
         steps: of a segment.
         env_low: lower corner of E.
@@ -221,6 +222,8 @@ def generate_open_loop(
     """
     low = jnp.asarray(vehicle.control_low)
     high = jnp.asarray(vehicle.control_high)
+    # The smallest divisor is below all speeds, also those of a slow vehicle.
+    crawl = min(1.0, 0.5 * speed[0])
 
     def segment(key: Key) -> Trajectory:
         env_key, speed_key, bend_key, spread_key, noise_key = jax.random.split(key, 5)
@@ -231,8 +234,8 @@ def generate_open_loop(
         # The share is squared: most turns are wide, as on roads, and some are as tight
         # as the axes of a law are long.
         share = jax.random.uniform(bend_key, (), minval=-1.0)
-        tightest = jnp.minimum(lateral_acceleration / first_speed**2, 0.25)
-        steering = jnp.arctan(vehicle.wheelbase * share * jnp.abs(share) * tightest)
+        bend = jnp.minimum(lateral_acceleration / first_speed**2, tightest)
+        steering = jnp.arctan(vehicle.wheelbase * share * jnp.abs(share) * bend)
         spread = log_uniform(spread_key, jnp.asarray(OPEN_LOOP_EXCITATION))
         white = jax.random.normal(noise_key, (steps + SETTLING, 2))
 
@@ -244,7 +247,7 @@ def generate_open_loop(
             else:
                 drive = jnp.clip(0.5 * (last_speed - state[3]), -2.0, 2.0)
             # At a higher speed than at the start the same circle would need more grip.
-            slower = jnp.minimum(first_speed / jnp.maximum(state[3], 1.0), 1.0) ** 2
+            slower = jnp.minimum(first_speed / jnp.maximum(state[3], crawl), 1.0) ** 2
             control = jnp.stack([slower * steering, drive]) + noise
             control = jnp.clip(control, low, high)
             after = vehicle.step(state, control, env)

@@ -26,6 +26,12 @@ from sfkd_jax.driving.path_following.laws._path_law import (
 )
 from sfkd_jax.driving.path_following.laws._path_law import textbook_law as textbook_law
 from sfkd_jax.driving.path_following.laws._steady_turn import NEAR as NEAR
+from sfkd_jax.driving.path_following.laws._table_check import (
+    checked_law as checked_law,
+)
+from sfkd_jax.driving.path_following.laws._table_check import (
+    unsettled_coordinates as unsettled_coordinates,
+)
 from sfkd_jax.driving.path_following.tasks._along_path import (
     along_reference as along_reference,
 )

@@ -12,6 +12,7 @@ from sfkd_jax.driving.plants._late import LateState as LateState
 from sfkd_jax.driving.plants._late import late_loop as late_loop
 from sfkd_jax.driving.plants._own import check_step as check_step
 from sfkd_jax.driving.plants._own import described as described
+from sfkd_jax.driving.plants._own import hidden_change as hidden_change
 from sfkd_jax.driving.plants._own import on_host as on_host
 from sfkd_jax.driving.plants._own import own as own
 from sfkd_jax.driving.plants._own import simulator as simulator

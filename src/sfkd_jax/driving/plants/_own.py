@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,13 @@ from sfkd_jax.driving.plants._variables import (
 from sfkd_jax.driving.plants._vehicle import Vehicle, nominal_derivative, rk4
 from sfkd_jax.ranges import Bounds, Positive
 from sfkd_jax.types import Control, Environment, State, Step
+
+TRIES = 32
+"""Vehicles on which `hidden_change` looks for states that nobody names."""
+SETTLING = 5
+"""Steps before it looks."""
+FORGOTTEN = 0.01
+"""Share of the change over a step from which on a difference is one."""
 
 
 def own(
@@ -119,6 +126,7 @@ def simulator(make: Make) -> Vehicle:
                                   default as many as there are cores
         timeout_s                 for a worker's part of a batch
         environment_names         of the entries of e, with units
+        speed                     slowest and fastest reference speed [m/s]
 
     The step works under `jit`, `vmap` and `scan`, a batch at a time, and has no
     gradient. If the simulator fails, the state is NaN, and a warning says why.
@@ -129,19 +137,39 @@ def simulator(make: Make) -> Vehicle:
     Raises:
         ValueError: the simulator cannot be made; gives the reason.
     """
-    settings, _ = described(make)
-    return own(**settings, step=on_host(make))
+    return own(**described(make).arguments, step=on_host(make))
 
 
-def described(make: Make) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the settings of `own` and the names of e that a simulator states.
+class Described(NamedTuple):
+    """What a simulator states about its vehicle.
+
+    Attributes:
+        arguments: of `own`.
+        environment_names: names of the entries of e; () if it states none.
+        speed: range of the speeds that it is driven at [m/s]; None if it states none.
+    """
+
+    arguments: dict[str, Any]
+    environment_names: tuple[str, ...]
+    speed: tuple[float, float] | None
+
+
+def described(make: Make) -> Described:
+    """Return what a simulator states about its vehicle.
 
     Raises:
-        ValueError: the simulator cannot be made; gives the reason.
+        ValueError: the simulator cannot be made, or states no range of speeds; gives
+            the reason.
     """
-    settings = dict(pool_of(make).settings)
-    environment_names = settings.pop("environment_names")
-    return settings, environment_names
+    stated = dict(pool_of(make).settings)
+    environment_names = stated.pop("environment_names")
+    speed = stated.pop("speed", None)
+    if speed is not None and not (len(speed) == 2 and 0.0 < speed[0] < speed[1]):
+        raise ValueError(
+            f"vehicle.env={make}: its speed must be two rising numbers above 0 [m/s], "
+            f"got {speed}"
+        )
+    return Described(stated, environment_names, speed)
 
 
 def on_host(make: Make) -> Step:
@@ -164,6 +192,60 @@ def on_host(make: Make) -> Step:
         )
 
     return step
+
+
+def hidden_change(
+    make: Make,
+    vehicle: Vehicle,
+    *,
+    speed: tuple[float, float],
+    env_low: tuple[float, ...],
+    env_high: tuple[float, ...],
+) -> dict[str, float]:
+    """Return how far states are off after two steps, where a reset forgets the rest.
+
+    A simulator that was reset once is compared with one that was reset before either
+    step. They agree if the state decides all that follows. Otherwise the simulator has
+    states of its own, which start anew at every step of a run.
+
+    Args:
+        make: the simulator.
+        vehicle: that it simulates.
+        speed: range of speeds to try [m/s].
+        env_low: lower corner of E.
+        env_high: upper corner of E.
+
+    Returns:
+        The root mean square by name, of states for which it is more than `FORGOTTEN` of
+        what they change in the second step; {} if the simulator always fails.
+    """
+    pool = pool_of(make)
+    draw = np.random.default_rng(0).uniform
+    # Half of the controls: beyond it many vehicles saturate.
+    low = 0.5 * np.asarray(vehicle.control_low)
+    high = 0.5 * np.asarray(vehicle.control_high)
+    controls = draw(low, high, (TRIES, len(low)))
+    envs = draw(env_low, env_high, (TRIES, len(env_low)))
+    inputs = np.concatenate([controls, envs], axis=1)
+    states = np.zeros((TRIES, len(vehicle.states)))
+    states[:, 3] = draw(*speed, TRIES)
+    # Any state would do, and one that driving leads to is never beyond the simulator.
+    for _ in range(SETTLING):
+        states = pool.step(np.concatenate([states, inputs], axis=1))
+    start = np.concatenate([states, inputs], axis=1)
+    between = pool.step(start)
+    twice = pool.step(np.concatenate([between, inputs], axis=1))
+    once = pool.step(start, steps=2)
+    tried = np.isfinite(twice).all(axis=1) & np.isfinite(once).all(axis=1)
+    if not tried.any():
+        return {}
+    off = np.sqrt(np.mean((twice - once)[tried] ** 2, axis=0))
+    change = np.sqrt(np.mean((once - between)[tried] ** 2, axis=0))
+    return {
+        name: float(distance)
+        for name, distance, moved in zip(vehicle.state_names, off, change, strict=True)
+        if distance > FORGOTTEN * moved
+    }
 
 
 def check_step(plant: Vehicle, environments: int = 2) -> None:

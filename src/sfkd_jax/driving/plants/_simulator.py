@@ -34,6 +34,7 @@ OPTIONAL_SETTINGS = (
     "wheelbase",
     "wind_force",
     "speed_loop",
+    "speed",
 )
 """Attributes of a simulator that describe its vehicle, besides `state_names`."""
 PATIENCE = 120.0
@@ -71,8 +72,13 @@ class Pool:
         self._workers = [first, *(_Worker(make) for _ in range(others))]
         self._lock = Lock()
 
-    def step(self, rows: np.ndarray) -> np.ndarray:
-        """Return the state one step after each row (state, control, environment)."""
+    def step(self, rows: np.ndarray, steps: int = 1) -> np.ndarray:
+        """Return the state after each row (state, control, environment).
+
+        Args:
+            rows: one for each vehicle.
+            steps: number of steps after the reset to the state of the row.
+        """
         states = np.full((len(rows), len(self.settings["state_names"])), np.nan)
         # A run that has ended stays NaN, and its rows are not simulated.
         alive = np.flatnonzero(np.isfinite(rows).all(axis=1))
@@ -82,9 +88,9 @@ class Pool:
         # the plans that they make in between.
         with self._lock:
             for worker, part in zip(workers, parts, strict=False):
-                worker.send(rows[part])
+                worker.send((rows[part], steps))
             for worker, part in zip(workers, parts, strict=False):
-                states[part] = worker.states(rows[part])
+                states[part] = worker.states(rows[part], steps)
         return states
 
 
@@ -131,14 +137,15 @@ class _Worker:
         with suppress(OSError):
             self._channel.send(request)
 
-    def states(self, rows: np.ndarray) -> Any:
-        """Return the states one step after the rows that were sent."""
+    def states(self, rows: np.ndarray, steps: int) -> Any:
+        """Return the states after the rows and the number of steps that were sent."""
         states, faults = self._answer(self._patience)
         if states is None:
             self.start()
             # Every row is sent again alone, so that only the row at fault is lost.
             if len(rows) > 1:
-                return np.concatenate([self._states_of_row(row[None]) for row in rows])
+                alone = [self._states_of_row(row[None], steps) for row in rows]
+                return np.concatenate(alone)
             states = np.full((1, self._size), np.nan)
         for fault in faults:
             # The type of the fault, without its numbers, which differ at every step.
@@ -148,9 +155,9 @@ class _Worker:
                 warnings.warn(f"simulator {self._make}: {fault}", stacklevel=2)
         return states
 
-    def _states_of_row(self, row: np.ndarray) -> Any:
-        self.send(row)
-        return self.states(row)
+    def _states_of_row(self, row: np.ndarray, steps: int) -> Any:
+        self.send((row, steps))
+        return self.states(row, steps)
 
     def _answer(self, seconds: float) -> tuple[Any, list[str]]:
         """Return answer and faults; the answer is None if the process hangs or died."""
@@ -183,6 +190,7 @@ class _Environment:
         observation, _, terminated, *_ = self._env.step(control)
         if terminated:
             raise RuntimeError("the episode was terminated")
+        self._state = np.asarray(observation)[: len(self._state)]
         return observation
 
 
@@ -223,13 +231,14 @@ def _serve(channel: Connection) -> None:
     channel.send((settings, []))
     size = len(settings["state_names"])
     while True:
-        rows = channel.recv()
+        rows, steps = channel.recv()
         faults = []
         states = np.full((len(rows), size), np.nan)
         for index, row in enumerate(rows):
             try:
                 simulator.reset(row[:size])
-                after = simulator.step(row[size : size + 2], row[size + 2 :])
+                for _ in range(steps):
+                    after = simulator.step(row[size : size + 2], row[size + 2 :])
                 after = np.asarray(after, dtype=float).ravel()[:size]
                 if len(after) < size or not np.isfinite(after).all():
                     raise ValueError(f"{after.tolist()} are not {size} finite numbers")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,7 @@ def derive_path_law(
     curvature: Positive = 100.0,
     curvature_power: NonNegative = 0.0,
     drive: Positive = 0.5,
+    unsettled: tuple[int, ...] = (),
 ) -> PathLaw:
     """Tabulate steady turns and gains over (v_ref² κ, v_ref, e), from a step alone.
 
@@ -80,6 +81,7 @@ def derive_path_law(
             loop has the same shape along the path at every speed, and with 4 the weight
             is one on the lateral acceleration, and the loop is equally fast in time.
         drive: weight, per control unit².
+        unsettled: coordinates of ξ that no steady turn fixes; they stay 0 in ξ*.
     """
     low = (-lateral_acceleration, speed[0], *env_low)
     high = (lateral_acceleration, speed[1], *env_high)
@@ -103,7 +105,8 @@ def derive_path_law(
         controls = jnp.stack([weight / steering_slope**2, jnp.asarray(drive)])
         return riccati_gain(slopes, (lateral, heading, velocity), controls)
 
-    row = partial(_row, path_step(step), gain_of, coordinates, axes[0])
+    sizes = _Coordinates(coordinates, unsettled)
+    row = partial(_row, path_step(step), gain_of, sizes, axes[0])
     # In batches, because a vmap over the whole grid would hold all Newton iterations.
     tables = jax.lax.map(row, grid.reshape(-1, len(axes) - 1), batch_size=64)
     state, control, gain = (
@@ -119,10 +122,17 @@ def derive_path_law(
     )
 
 
+class _Coordinates(NamedTuple):
+    """The size of ξ, and its entries that no steady turn fixes."""
+
+    size: int
+    unsettled: tuple[int, ...]
+
+
 def _row(
     step: PathStep,
     gain_of: Callable[[Array, Scalar, Scalar], Array],
-    size: int,
+    coordinates: _Coordinates,
     accelerations: Array,
     condition: Array,
 ) -> tuple[Array, Array, Array]:
@@ -131,10 +141,11 @@ def _row(
     Args:
         step: of the vehicle in path coordinates.
         gain_of: (slopes of the step, d steering / d curvature, v_ref) -> K.
-        size: of ξ.
+        coordinates: of ξ.
         accelerations: the v_ref² κ.
         condition: (v_ref, *e).
     """
+    size = coordinates.size
     middle = len(accelerations) // 2
     curvatures = accelerations / condition[0] ** 2
 
@@ -148,7 +159,7 @@ def _row(
         # The point of the table determines both entries, so they are set anew for each
         # turn.
         start = known.at[LATERAL].set(0.0).at[PATH_SPEED].set(condition[0])
-        turn, steady = steady_turn(moved(kappa), start)
+        turn, steady = steady_turn(moved(kappa), start, coordinates.unsettled)
         # If the car is too fast for the friction, the turn of the next smaller
         # curvature stays.
         turn = jnp.where(steady, turn, known)
@@ -193,7 +204,9 @@ def by_differences(
 
 
 def steady_turn(
-    moved: Callable[[Array], Array], start: Float[Array, " turn"]
+    moved: Callable[[Array], Array],
+    start: Float[Array, " turn"],
+    unsettled: tuple[int, ...] = (),
 ) -> tuple[Float[Array, " turn"], Bool[Array, ""]]:
     """Solve ξ* = F(ξ*, u*) by Newton's method.
 
@@ -203,31 +216,63 @@ def steady_turn(
     Args:
         moved: (ξ, u) -> ξ one step later.
         start: (ξ, u) from which the search starts.
+        unsettled: coordinates that stay as in `start` and are not asked to be steady.
 
     Returns:
         (ξ*, u*), and whether it solves the equation.
     """
     size = start.shape[0] - 2
     # e_y and v are fixed: the car is on its path, at the reference speed.
-    free = jnp.asarray([1, *range(3, size + 2)])
+    free = jnp.asarray([i for i in (1, *range(3, size + 2)) if i not in unsettled])
+    steady_rows = jnp.asarray([i for i in range(size) if i not in unsettled])
 
-    def newton(_: Any, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        unknowns, _, _ = carry
-        turn = start.at[free].set(unknowns)
+    def newton(_: Any, carry: _Search) -> _Search:
+        turn = start.at[free].set(carry.unknowns)
         after, slopes = by_differences(moved, turn)
-        gap = after - turn[:size]
+        gap = (after - turn[:size])[steady_rows]
         # A square matrix: two controls take the places of the two fixed coordinates.
-        matrix = (slopes - jnp.eye(size, size + 2))[:, free]
-        better = unknowns - solve(matrix, gap[:, None])[:, 0]
-        # A NaN compares as False, so a turn that diverged is never steady.
-        steady = jnp.max(jnp.abs(gap)) < RESIDUAL_TOLERANCE
-        return better, turn, steady & jnp.all(jnp.isfinite(turn))
+        matrix = (slopes - jnp.eye(size, size + 2))[steady_rows][:, free]
+        better = carry.unknowns - solve(matrix, gap[:, None])[:, 0]
+        # A NaN compares as False, so a turn that diverged is never the nearest.
+        residual = jnp.where(
+            jnp.all(jnp.isfinite(turn)), jnp.max(jnp.abs(gap)), jnp.inf
+        )
+        is_nearer = residual < carry.nearest_residual
+        return _Search(
+            unknowns=better,
+            turn=turn,
+            residual=residual,
+            nearest=jnp.where(is_nearer, turn, carry.nearest),
+            nearest_residual=jnp.minimum(residual, carry.nearest_residual),
+        )
 
-    carry = (start[free], start, jnp.asarray(False))
+    far = jnp.asarray(jnp.inf)
+    search = _Search(start[free], start, far, start, far)
     # The loop holds the only copy of the step and its derivative, which take long to
     # compile. Its last pass evaluates them where the others have led.
-    _, turn, steady = jax.lax.fori_loop(0, NEWTON + 1, newton, carry)
-    return turn, steady
+    search = jax.lax.fori_loop(0, NEWTON + 1, newton, search)
+    converged = search.residual < RESIDUAL_TOLERANCE
+    # A learned model is rough, and Newton's method may leave its turn again.
+    turn = jnp.where(converged, search.turn, search.nearest)
+    return turn, converged | (search.nearest_residual < RESIDUAL_TOLERANCE)
+
+
+class _Search(NamedTuple):
+    """Newton's method on the way to a steady turn.
+
+    Attributes:
+        unknowns: of the next turn to try.
+        turn: that was tried last.
+        residual: of that turn; infinite if it is not finite.
+        nearest: the turn with the smallest residual so far.
+        nearest_residual: of that turn.
+    """
+
+    unknowns: Array
+    turn: Array
+    residual: Scalar
+    nearest: Array
+    nearest_residual: Scalar
 
 
 def riccati_gain(
