@@ -108,6 +108,11 @@ class DrivingTask:
             raise ValueError(f"duration must be at least a step, got {self.duration}")
         road = jax.eval_shape(self.family, jax.random.key(0))
         shape = road.initial_state.shape
+        if self.plant.hidden:
+            raise ValueError(
+                f"vehicle {self.plant.name} has hidden states, which this environment "
+                "does not keep"
+            )
         plant_shape = (len(self.plant.state_names),)
         if shape != plant_shape:
             raise ValueError(

@@ -216,7 +216,9 @@ def reference_systems(
     "nominal" predicts with the bicycle, "oracle" with the true plant. With a law they
     describe its closed loop, in path coordinates; "law" is then the oracle once more,
     for a planner without samples (`num_samples=1`), so that the law drives alone.
+    What a vehicle hides, no planner can know.
     """
+    plant = plant.forgetting()
     if law is not None:
         plant = build_loop(plant, law)
     physics = partial(models.physics, frame=PATH_FRAME if law else BODY_FRAME)

@@ -138,6 +138,9 @@ def load_systems(run: Run) -> dict[str, System]:
         if name == "oracle" and run.source.has_simulator:
             store.print_message("no oracle: it would plan with copies of the simulator")
             continue
+        if name == "oracle" and run.plant.hidden:
+            store.print_message("no oracle: the vehicle has states that nobody sees")
+            continue
         if name == "self":
             systems[settings.model.system] = _policy_system(run)
             continue
@@ -202,6 +205,7 @@ class SystemEvaluation:
             observation_noise=run.sensors,
             latency=run.latency,
             size=plant.size,
+            hidden=plant.hidden,
         )
         self._simulate = _over_episodes(simulate)
 

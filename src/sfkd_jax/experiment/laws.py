@@ -135,7 +135,7 @@ def _unsettled(simulate: _Simulation, step: Step) -> tuple[int, ...]:
     plant = simulate.plant
     drives = simulate.drives
     # A learned model has no zeros, so the vehicle is asked.
-    asked = plant.step if drives.law.model == "learned" else step
+    asked = plant.forgetting().step if drives.law.model == "learned" else step
     low, high = (np.asarray(end, float) for end in simulate.box.values())
     found = unsettled_coordinates(
         asked,
@@ -178,6 +178,11 @@ def _step_of_model(simulate: _Simulation, name: str) -> Step:
     # A model of logs is a learned one already.
     if name == "learned" and plant.name != LOGGED:
         return _learned_step(simulate)
+    if plant.hidden:
+        raise ValueError(
+            f"vehicle {plant.name} has hidden states, which no law can know: "
+            "dataset.law.model=learned"
+        )
     return plant.step
 
 
@@ -293,7 +298,10 @@ def _lateral_error(simulate: _Simulation, step: Step) -> Callable[[PathLaw], flo
 
     @jax.jit
     def drive(law: PathLaw) -> Trajectory:
-        vehicle = simulate.plant._replace(step=step)
+        vehicle = simulate.plant
+        # Only the vehicle itself has hidden states; a model of it has none.
+        if step is not vehicle.step:
+            vehicle = vehicle._replace(step=step, hidden=0)
         loop = along_path(vehicle, law, perturbation=perturbation)
         return generate_along_path(loop, key, **options)
 

@@ -181,8 +181,9 @@ class DataSource:
         listed = ", ".join(f"{name} by {value:.3g}" for name, value in found.items())
         store.print_message(
             f"simulator {vehicle.env}: two steps from one reset differ from two resets "
-            f"in {listed} (RMS): it has states that state_names does not name. They "
-            "start anew at every step, so another vehicle is learned and certified"
+            f"in {listed} (RMS): it has states that neither state_names nor "
+            "hidden_names name. They start anew at every step, so another vehicle is "
+            "learned and certified"
         )
 
     def _drive(self, *, switching: bool = False, **changes: int) -> data.Drive:

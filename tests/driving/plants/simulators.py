@@ -90,6 +90,21 @@ class Forgetful(Small):
         return super().step([self.steering, control[1]], environment)[:4]
 
 
+class Remembering(Small):
+    """The same, which names the servo as a state that no sensor shows."""
+
+    state_names = Small.state_names[:4]
+    hidden_names = (*Small.state_names[4:], "steering")
+
+    def reset(self, state):
+        self.state, self.steering = state[:-1], state[-1]
+
+    def step(self, control, environment):
+        self.steering += 0.5 * (control[0] - self.steering)
+        after = super().step([self.steering, control[1]], environment)
+        return np.append(after, self.steering)
+
+
 class Backwards(Small):
     """The same with a range of speeds that is none."""
 

@@ -96,6 +96,8 @@ def linearised(
 ) -> Linearisation:
     """Linearise plant and law at a steady turn, by differences.
 
+    In place of a plant with hidden states its model is linearised.
+
     Args:
         loop: of the policy.
         speed: v_ref [m/s].
@@ -110,7 +112,14 @@ def linearised(
 
     def advance(turn: Array) -> Array:
         inputs = jnp.concatenate([turn[size:], road])
-        return loop.plant.step(without_pose(turn[:size]), inputs, env)[BODY]
+        state = without_pose(turn[:size])
+        # A turn is not steady in states that nobody knows; the model has no others.
+        if loop.plant.hidden:
+            model = loop.model.predicting
+            fiber = model.fiber(loop.params, env)
+            latent = model.step(fiber, model.encode(fiber, state), inputs)
+            return model.decode(fiber, latent)[BODY]
+        return loop.plant.step(state, inputs, env)[BODY]
 
     # Of the closed loop, whose inputs are ν: A − B K and B.
     at = jnp.concatenate([steady.state, jnp.zeros(2)])

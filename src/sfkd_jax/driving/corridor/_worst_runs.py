@@ -212,29 +212,31 @@ def outcome_of(
     def step(carry: Any, at_step: tuple[Array, Environment, Array]) -> tuple[Any, Any]:
         state, latent, error, memory = carry
         inputs, env, index = at_step
+        shown = plant.shown(state)
         fiber = model.fiber(params, env)
         # The filter sees the nominal model, as in the controller.
         if nu_filter is not None:
             nu = nu_filter(fiber, latent, inputs[PERTURBATION], index)
             inputs = inputs.at[PERTURBATION].set(nu)
-        expected = model.step(fiber, model.encode(fiber, state), inputs)
-        nu, _, memory = sensors.read(memory, no_noise, state, inputs, env)
+        expected = model.step(fiber, model.encode(fiber, shown), inputs)
+        nu, _, memory = sensors.read(memory, no_noise, shown, inputs, env)
         state = plant.step(state, inputs.at[PERTURBATION].set(nu), env)
+        shown = plant.shown(state)
         latent = model.step(fiber, latent, inputs)
         nominal_state = model.decode(fiber, latent)
         expected_state = model.decode(fiber, expected)
         true, nominal, predicted = (
-            each[BODY][LATERAL] for each in (state, nominal_state, expected_state)
+            each[BODY][LATERAL] for each in (shown, nominal_state, expected_state)
         )
         # The tube bounds the output before its radius grows by this disturbance.
         radius = claim.lipschitz * claim.alpha * error + jnp.abs(true - predicted)
-        gap = model.vector(model.encode(fiber, state)) - model.vector(expected)
+        gap = model.vector(model.encode(fiber, shown)) - model.vector(expected)
         error = claim.alpha * error + jnp.linalg.norm(gap @ factor)
         values = Outcome(jnp.abs(true), jnp.abs(true - nominal), radius)
         return (state, latent, error, memory), values
 
     steps = (run_inputs, envs, jnp.arange(len(run_inputs)))
-    carry = (start, latent, jnp.zeros(()), memory)
+    carry = (plant.whole(start), latent, jnp.zeros(()), memory)
     _, outcomes = jax.lax.scan(step, carry, steps)
     return jax.tree.map(jnp.max, outcomes)
 

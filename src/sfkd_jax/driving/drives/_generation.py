@@ -178,12 +178,12 @@ def _follow_path(vehicle: Vehicle, driver: Driver, task: _Task) -> Trajectory:
         )
         # Clipped after the excitation is added: the model is to learn from the command
         # that was applied.
-        control = jnp.clip(driver(state, ahead) + noise, low, high)
+        control = jnp.clip(driver(vehicle.shown(state), ahead) + noise, low, high)
         after = vehicle.step(state, control, env)
         progress, _ = project(task.path, after[:2], progress + after[3] * vehicle.dt)
-        return (after, progress, noise), (after, control)
+        return (after, progress, noise), (vehicle.shown(after), control)
 
-    carry = (task.start, task.progress, task.spread * task.white[0])
+    carry = (vehicle.whole(task.start), task.progress, task.spread * task.white[0])
     _, (states, controls) = jax.lax.scan(step, carry, (task.envs, task.white))
     return Trajectory(
         states=states[SETTLING - 1 :],
@@ -251,9 +251,10 @@ def generate_open_loop(
             control = jnp.stack([slower * steering, drive]) + noise
             control = jnp.clip(control, low, high)
             after = vehicle.step(state, control, env)
-            return (after, noise), (after, control)
+            return (after, noise), (vehicle.shown(after), control)
 
         start = jnp.zeros(len(vehicle.state_names)).at[3].set(first_speed)
+        start = vehicle.whole(start)
         _, (states, controls) = jax.lax.scan(step, (start, spread * white[0]), white)
         return Trajectory(
             states=states[SETTLING - 1 :],

@@ -202,15 +202,16 @@ def drive_along_path(
         ) -> tuple[Any, Any]:
             state, memory = carry
             control, env, step_key = inputs
-            nu, reading, memory = read(memory, step_key, state, control, env)
+            shown = loop.shown(state)
+            nu, reading, memory = read(memory, step_key, shown, control, env)
             after = loop.step(state, control.at[PERTURBATION].set(nu), env)
-            return (after, memory), (after, reading)
+            return (after, memory), (loop.shown(after), reading)
 
         memory = None
         if sensors is not None:
             memory = sensors.init(start, controls[0], run_envs[0])
         _, (states, readings) = jax.lax.scan(
-            step, (start, memory), (controls, run_envs, step_keys)
+            step, (loop.whole(start), memory), (controls, run_envs, step_keys)
         )
         states = jnp.concatenate([start[None], states])
         driven = Trajectory(states, controls, run_envs)

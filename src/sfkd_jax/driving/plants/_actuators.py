@@ -79,6 +79,11 @@ def with_servo(vehicle: Vehicle, *, lag: Positive, rate: float = math.inf) -> Ve
             f"vehicle.servo_lag: vehicle {vehicle.name} has a state steering already, "
             "and turns it itself"
         )
+    if vehicle.hidden:
+        raise ValueError(
+            f"vehicle.servo_lag: vehicle {vehicle.name} has hidden states, and its "
+            "servo belongs among them"
+        )
     part = vehicle.dt / SERVO_PARTS
     share = -jnp.expm1(-part / lag)
 

@@ -78,6 +78,13 @@ def along_path(
         )
     # Law and ν together are clipped, as the actuators of the car do.
     limits = (vehicle.control_low, vehicle.control_high)
+    coordinates = len(vehicle.states) - 1
+
+    def seen_by_law(
+        xi: State, curvature: Scalar, speed: Scalar, env: Environment
+    ) -> Control:
+        return law(xi[:coordinates], curvature, speed, env)
+
     nominal = step_with_law(vehicle.nominal, law, *limits)
     largest = tuple(map(float, perturbation))
 
@@ -95,7 +102,7 @@ def along_path(
         states=path_states(vehicle),
         # Limits of w to draw from. The loop itself clips only the control u.
         controls=(*perturbations, *controls[2:]),
-        step=step_with_law(vehicle.step, law, *limits),
+        step=step_with_law(vehicle.step, seen_by_law, *limits),
         derivative=None,
         nominal=nominal,
         nominal_derivative=nominal_derivative,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from sfkd_jax.driving.plants._variables import (
     states_of,
 )
 from sfkd_jax.driving.plants._vehicle import Vehicle, nominal_derivative, rk4
-from sfkd_jax.ranges import Bounds, Positive
+from sfkd_jax.ranges import Bounds, MayBeEmpty, Positive
 from sfkd_jax.types import Control, Environment, State, Step
 
 TRIES = 32
@@ -31,6 +31,7 @@ def own(
     *,
     dt: Positive = 0.1,
     state_names: tuple[str, ...] = ("p_x", "p_y", "yaw", "v"),
+    hidden_names: Annotated[tuple[str, ...], MayBeEmpty()] = (),
     control_low: Bounds = (),
     control_high: Bounds = (),
     wheelbase: Positive = 2.7,
@@ -50,6 +51,8 @@ def own(
     Args:
         dt: sampling period [s].
         state_names: pose first (p_x, p_y [m], yaw [rad]), then the speed [m/s].
+        hidden_names: further states of the step that no sensor shows, as that of a
+            servo. They begin at 0.
         control_low: lower limits of the actuators. They may be () without a step: the
             logs give them then.
         control_high: upper limits of the actuators, or ().
@@ -97,6 +100,7 @@ def own(
         wind_force=wind_force,
         speed_loop=speed_loop,
         simulated=step is not None,
+        hidden=len(hidden_names),
     )
 
 
@@ -121,7 +125,8 @@ def simulator(make: Make) -> Vehicle:
     `options={"state": …, "environment": …}` before every step, and its observation
     begins with the state. These attributes are optional:
 
-        settings of `own`         as attributes of the same names
+        settings of `own`         as attributes of the same names; `hidden_names` are
+                                  those of states that follow the others
         workers                   number of copies, each in a process of its own; by
                                   default as many as there are cores
         timeout_s                 for a worker's part of a batch
@@ -227,7 +232,7 @@ def hidden_change(
     controls = draw(low, high, (TRIES, len(low)))
     envs = draw(env_low, env_high, (TRIES, len(env_low)))
     inputs = np.concatenate([controls, envs], axis=1)
-    states = np.zeros((TRIES, len(vehicle.states)))
+    states = np.zeros((TRIES, len(vehicle.states) + vehicle.hidden))
     states[:, 3] = draw(*speed, TRIES)
     # Any state would do, and one that driving leads to is never beyond the simulator.
     for _ in range(SETTLING):
@@ -243,7 +248,7 @@ def hidden_change(
     change = np.sqrt(np.mean((once - between)[tried] ** 2, axis=0))
     return {
         name: float(distance)
-        for name, distance, moved in zip(vehicle.state_names, off, change, strict=True)
+        for name, distance, moved in zip(vehicle.state_names, off, change, strict=False)
         if distance > FORGOTTEN * moved
     }
 
@@ -260,19 +265,19 @@ def check_step(plant: Vehicle, environments: int = 2) -> None:
     Raises:
         ValueError: gives the reason.
     """
-    size = len(plant.state_names)
+    size = len(plant.state_names) + plant.hidden
     try:
         after = jax.eval_shape(plant.step, *map(jnp.zeros, (size, 2, environments)))
     except Exception as reason:  # The step is the user's and may raise anything.
         first_line = (str(reason).splitlines() or [type(reason).__name__])[0]
         raise ValueError(
             f"the step of vehicle {plant.name} fails on {size} states "
-            f"(vehicle.state_names), 2 controls and {environments} environments: "
-            f"{first_line}"
+            f"(vehicle.state_names, hidden_names), 2 controls and {environments} "
+            f"environments: {first_line}"
         ) from None
     shape = getattr(after, "shape", type(after).__name__)
     if shape != (size,):
         raise ValueError(
             f"the step of vehicle {plant.name} returns {shape}, "
-            f"vehicle.state_names has {size} names"
+            f"vehicle.state_names and hidden_names have {size} names"
         )

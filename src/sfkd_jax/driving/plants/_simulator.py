@@ -67,6 +67,7 @@ class Pool:
         """
         first = _Worker(make)
         self.settings = first.start()
+        self._size = _size(self.settings)
         # The other processes start when there is work for them.
         others = self.settings.pop("workers") - 1
         self._workers = [first, *(_Worker(make) for _ in range(others))]
@@ -79,7 +80,7 @@ class Pool:
             rows: one for each vehicle.
             steps: number of steps after the reset to the state of the row.
         """
-        states = np.full((len(rows), len(self.settings["state_names"])), np.nan)
+        states = np.full((len(rows), self._size), np.nan)
         # A run that has ended stays NaN, and its rows are not simulated.
         alive = np.flatnonzero(np.isfinite(rows).all(axis=1))
         workers = self._workers[: len(alive)]
@@ -124,7 +125,7 @@ class _Worker:
         if faults:
             raise ValueError(f"vehicle.env={self._make}: {faults[0]}")
         self._patience = settings.pop("timeout_s")
-        self._size = len(settings["state_names"])
+        self._size = _size(settings)
         return settings
 
     def send(self, request: Any) -> None:
@@ -211,7 +212,13 @@ def _settings_of(simulator: Any) -> dict[str, Any]:
     environment_names = getattr(simulator, "environment_names", ())
     stated["environment_names"] = tuple(map(str, environment_names))
     stated["state_names"] = tuple(map(str, simulator.state_names))
+    stated["hidden_names"] = tuple(map(str, getattr(simulator, "hidden_names", ())))
     return stated
+
+
+def _size(settings: dict[str, Any]) -> int:
+    """Return the number of entries of a state, those that are hidden included."""
+    return len(settings["state_names"]) + len(settings["hidden_names"])
 
 
 def _serve(channel: Connection) -> None:
@@ -229,7 +236,7 @@ def _serve(channel: Connection) -> None:
         channel.send((None, [_line(reason)]))
         return
     channel.send((settings, []))
-    size = len(settings["state_names"])
+    size = _size(settings)
     while True:
         rows, steps = channel.recv()
         faults = []

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from sfkd_jax.driving.plants._variables import (
     ACCELERATION,
@@ -51,6 +52,8 @@ class Vehicle(NamedTuple):
             alone.
         derivative: dx/dt of the plant before any wrapper; None where only its step is
             known.
+        hidden: number of further entries of the state of `step`, after `states`. No
+            sensor shows them, and they begin at 0.
     """
 
     name: str
@@ -67,6 +70,26 @@ class Vehicle(NamedTuple):
     speed_loop: bool = False
     simulated: bool = True
     derivative: Step | None = None
+    hidden: int = 0
+
+    def whole(self, state: State) -> Float[Array, " whole"]:
+        """Return a state at the start of a run, with what is hidden, for `step`."""
+        return jnp.concatenate([state, jnp.zeros(self.hidden, state.dtype)])
+
+    def shown(self, state: Float[Array, " whole"]) -> State:
+        """Return the entries of a state of `step` that sensors show."""
+        return state[: len(self.states)]
+
+    def forgetting(self) -> Vehicle:
+        """Return the vehicle with its hidden states at 0 before every step.
+
+        Without hidden states it is the same vehicle.
+        """
+
+        def step(state: State, control: Control, env: Environment) -> State:
+            return self.shown(self.step(self.whole(state), control, env))
+
+        return self._replace(step=step, hidden=0) if self.hidden else self
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -67,6 +67,7 @@ def simulate(
     observation_noise: Sequence[float | Scalar] = (),
     latency: Latency = NO_LATENCY,
     size: tuple[float, float] | None = None,
+    hidden: int = 0,
     record: Mapping[str, Signal] | None = None,
 ) -> Episode:
     """Simulate one episode.
@@ -93,6 +94,8 @@ def simulate(
         latency: of sensors and controls, see `plants.Late`. The reference begins where
             the vehicle is observed.
         size: length and width of the car [m], which a course needs.
+        hidden: number of entries of the plant's state after those of the scenario's
+            start, which are not observed and begin at 0.
         record: more signals of every step, by name, besides those of the metrics.
 
     Raises:
@@ -103,18 +106,20 @@ def simulate(
     # Sensors have a key of their own, so that two systems meet the same noise.
     planner_key, noise_key = jax.random.split(key)
     recorded = SIGNALS | dict(record or {})
-    spread = _spread(observation_noise, len(scenario.initial_state))
+    observed = len(scenario.initial_state)
+    spread = _spread(observation_noise, observed)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
-    late = late_loop(latency, states=len(scenario.initial_state), dt=dt)
+    late = late_loop(latency, states=observed, dt=dt)
 
     def step(
         carry: tuple[State, Scalar, Any, LateState], inputs: tuple[Array, Array, Key]
     ) -> tuple[Any, Any]:
         state, progress, memory, pending = carry
         env, observed_env, sensor_key = inputs
-        arrived, pending = late.observe(pending, jnp.append(state, progress))
+        shown = state[:observed]
+        arrived, pending = late.observe(pending, jnp.append(shown, progress))
         # Noise reaches the controller alone, and neither plant nor scores.
-        noise = spread * jax.random.normal(sensor_key, state.shape)
+        noise = spread * jax.random.normal(sensor_key, shown.shape)
         observation = arrived[:-1] + noise
         ahead = _ahead(scenario, arrived[-1], dt=dt, horizon=horizon)
         control, memory, info = controller.act(
@@ -136,11 +141,12 @@ def simulate(
                 lateral = _beside(info.lane.reference[late.observed_ago :], state)
         signals = {name: signal(info) for name, signal in recorded.items()}
         carry = (state, progress, memory, pending)
-        return carry, (state, control, lateral, progress, signals)
+        return carry, (state[:observed], control, lateral, progress, signals)
 
     first = scenario.initial_state
     pending = late.init(jnp.append(first, 0.0))
-    start = (first, jnp.zeros(()), controller.init(planner_key), pending)
+    whole = jnp.concatenate([first, jnp.zeros(hidden, first.dtype)])
+    start = (whole, jnp.zeros(()), controller.init(planner_key), pending)
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
     return Episode(jnp.concatenate([first[None], states]), *rest)
