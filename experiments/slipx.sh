@@ -35,6 +35,6 @@ path=(
 )
 python -m sfkd_jax.train "${path[@]}" 'evaluation.systems=[self]' "$@"
 python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 \
-  'evaluation.systems=[law,law_stanley,law_pure_pursuit]' "$@"
+  'evaluation.systems=[law_plant,law_stanley,law_pure_pursuit]' "$@"
 python -m sfkd_jax.evaluate +experiment=s3_body name=slipx_nominal "${car[@]}" 'evaluation.systems=[nominal]' "$@"
 python -m experiments.simulator "$root" slipx
