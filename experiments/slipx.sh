@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # From a 1/10 car that nobody here wrote to its corridor (docs/your-vehicle.md). The simulator is that of slipx
 # (examples/slipx_car.py), whose grip and side force switch. Beside the policy drive the law alone, MPPI with the
-# textbook bicycle, Stanley's law and pure pursuit. The last line of the output is the line of slipx.json.
+# textbook bicycle, Stanley's law and pure pursuit. The last line of the output is one line of JSON.
 #
 #     bash experiments/slipx.sh [--small] [root=DIR and other Hydra overrides]
 set -euo pipefail
@@ -35,6 +35,6 @@ path=(
 )
 python -m sfkd_jax.train "${path[@]}" 'evaluation.systems=[self]' "$@"
 python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 \
-  'evaluation.systems=[law,law_stanley,law_pure_pursuit]' "$@"
+  'evaluation.systems=[law_plant,law_stanley,law_pure_pursuit]' "$@"
 python -m sfkd_jax.evaluate +experiment=s3_body name=slipx_nominal "${car[@]}" 'evaluation.systems=[nominal]' "$@"
 python -m experiments.simulator "$root" slipx

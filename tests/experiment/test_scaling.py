@@ -28,6 +28,7 @@ def test_a_car_keeps_every_default_to_the_last_bit():
     assert own(2.7).training == unscaled().training
     assert own(2.7).controller == unscaled().controller
     assert own(2.7).scenario == unscaled().scenario
+    assert own(2.7).evaluation == unscaled().evaluation
     for option in ("vehicle=kinematic", "vehicle=dynamic vehicle.front_length=0.1"):
         words = ("+experiment=s3", *option.split())
         values = parse_settings(plain(settings(*words)))

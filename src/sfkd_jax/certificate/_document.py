@@ -115,7 +115,8 @@ def write(
         signature = asdict(_signature.sign(digest, signing_key))
     document = {**document, "sha256": digest, "signature": signature}
     # Here and not after hours, where somebody loads it.
-    parse(store.plain(document), type(certificate))
+    kind: Any = type(certificate)
+    parse(store.plain(document), kind)
     store.write_json(path, document)
 
 

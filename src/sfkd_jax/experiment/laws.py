@@ -48,12 +48,12 @@ law alone. Simulation and split use 0 and 1, runs of S3 use 2.
 NO_EXCITATION = (1e-6, 2e-6)
 """Excitation of the law alone: none, but with a logarithm."""
 TIGHTEST_CIRCLES = 0.675
-"""Curvature of the tightest circles without a law, times the wheelbase [-]: 0.25 1/m for
-a car.
+"""Curvature of the tightest circles without a law, times the wheelbase [-]. For a car
+it is 0.25 1/m.
 """
-LOST = 0.4
-"""Largest lateral error that counts when laws are compared, in wheelbases: a vehicle
-that leaves its path is lost, however far.
+LOST = 1.0 / 2.7
+"""Largest lateral error that counts when laws are compared, in wheelbases: 1 m for a
+car. A vehicle that leaves its path is lost, however far.
 """
 LARGEST_RATIO = 1.5
 """A law of a learned model is accepted if its lateral error is at most this times what

@@ -181,8 +181,10 @@ def _sensors(
     noise = dict(_get(settings, NOISE))
     for state in _get(settings, "vehicle.state_names"):
         is_stated = noise.get(state) is not None or _is_typed(f"{NOISE}.{state}", typed)
-        if state in SENSORS and not is_stated:
-            factor = min(1.0, SENSORS[state].factor(scale))
+        if state not in SENSORS or is_stated:
+            continue
+        factor = SENSORS[state].factor(scale)
+        if factor < 1.0:
             noise[state] = _times(KNOWN_STATES[state].deviation, factor, None)
     return noise
 
