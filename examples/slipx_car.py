@@ -17,12 +17,13 @@ LAGS = ("lag_fl", "lag_fr", "lag_rl", "lag_rr")
 
 
 class Slipx:
-    """What `vehicle=simulator` asks of a simulator: names, `reset` and `step`."""
+    """What `vehicle=simulator` asks of a simulator: names, `reset` and `step`.
 
-    state_names = (
-        *("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate", "steering", "steering_rate"),
-        *LAGS,
-    )
+    No sensor shows the servo and the lags of the tyres.
+    """
+
+    state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
+    hidden_names = ("steering", "steering_rate", *LAGS)
     environment_names = ("grip [-]", "side force [N]")
     dt = 0.05
     wheelbase = 0.32

@@ -24,7 +24,7 @@ PREFIXES = {
 """System -> beginning of the names of its numbers; those of the policy have none, and
 "estimated_" where it estimates the environment.
 """
-ROWS = PREFIXES | {"law_plant": "law_"}
+ROWS = PREFIXES | {"law_learned": "law_"}
 """The same, with the law of the policy alone, which not every script drives."""
 
 
