@@ -67,7 +67,7 @@ APPLICATIONS = {
     "policy": PARTS | {"assembly"},
     "export": ROAD
     | {"assembly", "policy", "settings", "store"}
-    | {"certificate", "driving.certificate"},
+    | {"certificate", "driving.certificate", "driving.path_following"},
     "adapters": PLANT | {"assembly"},
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}
@@ -97,6 +97,8 @@ THIRD_PARTY = {
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
     "driving.path_coordinates": {"numpy"},
+    "driving.paths": {"numpy", "scipy"},
+    "driving.lanes": {"numpy"},
     "driving.plants": {"numpy"},
     "driving.path_following": {"numpy"},
     "driving.drives": {"numpy"},

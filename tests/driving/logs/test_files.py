@@ -614,6 +614,32 @@ def test_a_wind_that_is_constant_in_every_run_is_no_missing_value(tmp_path):
     np.testing.assert_array_equal(dataset.env_low[1], -6.0)
 
 
+@pytest.mark.parametrize(
+    ("name", "role", "refused"),
+    [
+        ("friction", None, True),
+        ("friction", "other", False),
+        ("grip", None, False),
+        ("grip", "friction", True),
+        ("load", "mass", True),
+    ],
+)
+def test_what_cannot_be_negative_is_stated_and_not_read_from_a_name(
+    tmp_path, name, role, refused
+):
+    columns = recorded_run()
+    columns[name] = columns.pop("friction")
+    change(name, slice(100, 105), -0.2)(columns)
+    path = write_csv(tmp_path / "a.csv", columns)
+    names = Columns(environment=(name, "wind"))
+    roles = {} if role is None else {"env_roles": (role, "side_force")}
+    if refused:
+        line = refusal(path, names, **roles)
+        assert f"line 102: {name} is -0.2, not a measured value" in line
+    else:
+        assert read(path, names, **roles)[0].dataset.env_low[0] == np.float32(-0.2)
+
+
 def test_a_yaw_rate_shows_a_late_yaw_and_driving_backwards_is_right(tmp_path):
     columns = recorded_run()
     columns["rate"] = 0.36 * np.cos(0.4 * columns["t"])

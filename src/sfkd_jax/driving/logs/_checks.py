@@ -61,6 +61,7 @@ class Checks:
     drop_missing: bool
     limits: Bounds
     box: Bounds
+    roles: tuple[str, ...] = ()
 
     def apply(self, logs: list[Log]) -> tuple[list[Log], list[Finding]]:
         """Return the runs that can be used, after cutting, and all findings."""

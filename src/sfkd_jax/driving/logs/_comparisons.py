@@ -15,6 +15,7 @@ from jaxtyping import Float
 from sfkd_jax.driving.logs._checks import Checks
 from sfkd_jax.driving.logs._findings import Finding, first_of, warning
 from sfkd_jax.driving.logs._logs import Log
+from sfkd_jax.driving.plants import FRICTION, MASS
 
 Steps: TypeAlias = Float[np.ndarray, " step"]
 Values: TypeAlias = Float[np.ndarray, " _"]
@@ -29,6 +30,8 @@ change the gain by less.
 """
 OTHER_UNIT = 20.0
 """Ratio of the values of two runs from which on they are in different units."""
+NEVER_NEGATIVE = (FRICTION, MASS)
+"""Roles of entries of e that cannot be below 0."""
 BEYOND = 30.0
 """Ratio of a value to all others from which on it stands for a missing one."""
 
@@ -48,12 +51,12 @@ def compare(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     names = checks.columns.environment
     if len(names) != size:
         return
-    for k, name in enumerate(names):
+    for k, (name, role) in enumerate(zip(names, checks.roles, strict=True)):
         channel = [log.envs[:, k] for log in logs]
         yield from _odd_units(logs, channel, name)
         # Whoever states E says which values are real; others are refused elsewhere.
         if checks.box == (None, None):
-            yield from _placeholders(logs, channel, name)
+            yield from _placeholders(logs, channel, name, role)
 
 
 def turns(log: Log) -> tuple[Steps, Steps]:
@@ -141,7 +144,7 @@ def _odd_units(
 
 
 def _placeholders(
-    logs: list[Log], channel: Sequence[Values], name: str
+    logs: list[Log], channel: Sequence[Values], name: str, role: str
 ) -> Iterator[Finding]:
     """Find a number that stands for a missing one, such as 9999, or a friction of -1.
 
@@ -149,6 +152,7 @@ def _placeholders(
         logs: the runs.
         channel: its values in each run.
         name: of the channel.
+        role: of the entry of e, see `plants.roles_of`.
     """
     sizes = np.abs(np.concatenate(channel))
     largest = float(sizes.max())
@@ -158,7 +162,7 @@ def _placeholders(
         odd = np.abs(values) == largest if beyond else np.zeros(len(values), dtype=bool)
         # A run that has one value throughout has been measured so.
         odd &= not odd.all()
-        if name.startswith("friction"):
+        if role in NEVER_NEGATIVE:
             odd |= values < 0.0
         yield from first_of(
             log,

@@ -18,6 +18,7 @@ from sfkd_jax.driving.logs._log_files import log_files
 from sfkd_jax.driving.logs._logs import Columns, Log
 from sfkd_jax.driving.logs._reading import read_logs
 from sfkd_jax.driving.logs._segments import Piece, assign_parts, pieces, segments
+from sfkd_jax.driving.plants import roles_of
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
 from sfkd_jax.types import BODY, Trajectory
 
@@ -63,6 +64,7 @@ def from_logs(
     seed: NonNegativeInt = 0,
     env_low: tuple[Real, ...] | None = None,
     env_high: tuple[Real, ...] | None = None,
+    env_roles: tuple[str, ...] = (),
 ) -> LoggedDataset:
     """Make a data set of recorded runs, or refuse them with the reason.
 
@@ -86,6 +88,8 @@ def from_logs(
         seed: of the random order of runs.
         env_low: lower corner of E, or None for a box as large as the logs need.
         env_high: upper corner of E, or None.
+        env_roles: what each entry of e is, see `plants.roles_of`; () for what the
+            names of the columns say.
 
     Raises:
         ValueError: the first reason why the logs are refused; the others are reported.
@@ -103,6 +107,7 @@ def from_logs(
         drop_missing=missing == "drop",
         limits=limits,
         box=box,
+        roles=roles_of(columns.environment, env_roles),
     )
     logs = _checked_logs(path, checks, needs_environment, report)
     lags = command_lags(checks, logs)

@@ -80,6 +80,8 @@ class Situation(NamedTuple):
         road: ahead of the car.
         committed: the reference that the car follows, from the same sample on.
         obstacles: all of them finite.
+        counts_from: step from which on each obstacle counts, see
+            `_followers.counts_from`.
         place: of the car, in samples from the first one.
         grip: acceleration that the tyres allow [m/s²].
         clean: whether all numbers of the scene are finite; if not, nothing is free.
@@ -88,6 +90,7 @@ class Situation(NamedTuple):
     road: RoadAhead
     committed: Committed
     obstacles: Obstacles
+    counts_from: Float[Array, " obstacle"]
     place: Scalar
     grip: Scalar
     clean: Bool[Array, ""]
@@ -189,10 +192,11 @@ class Judge:
         # Obstacles come one after the other: all samples of all plans are then one long
         # loop, in which nothing is looked up.
         def nearer(nearest: Array, inputs: Any) -> tuple[Array, None]:
-            obstacle, place = inputs
+            obstacle, place, counts_from = inputs
             gap = distance(
                 obstacle, place, along.position, along.direction, self.limits.half
             )
+            gap = jnp.where(steps >= counts_from, gap, jnp.inf)
             return jnp.minimum(nearest, gap), None
 
         def places_of(obstacle: Obstacles) -> Any:
@@ -200,7 +204,8 @@ class Judge:
 
         places = jax.vmap(places_of)(situation.obstacles)
         free = jnp.full(samples.shape, jnp.inf)
-        gap, _ = jax.lax.scan(nearer, free, (situation.obstacles, places))
+        obstacles = (situation.obstacles, places, situation.counts_from)
+        gap, _ = jax.lax.scan(nearer, free, obstacles)
         gap = gap - LATE - self.limits.margin
         gap = jnp.where(_counts(along), gap, jnp.inf)
         return jnp.where(situation.clean, gap, -jnp.inf)
