@@ -221,6 +221,12 @@ def stale(columns):
     columns.update({name: columns[name][held] for name in ("p_x", "p_y")})
 
 
+def bursts(columns):
+    """Five rows at a time, stamped on arrival 1 ms apart."""
+    rows = np.arange(301)
+    columns["t"] = 0.5 * (rows // 5) + 1e-3 * (rows % 5)
+
+
 def late(names, steps):
     """The columns come some rows after the others."""
 
@@ -343,6 +349,19 @@ WRONG = {
     "no wind": (
         change("wind", slice(100, 105), 9999.0),
         ", line 102: wind is 9999, not a measured value (5 rows like this)",
+    ),
+    "no steering": (
+        change("steering", slice(100, 105), -9999.0),
+        ", line 102: steering is -9999, not a measured value (5 rows like this); leave",
+    ),
+    "a yaw of half its size": (
+        scale("yaw", lambda yaw: 0.5 * yaw),
+        ", lines 2 to 302: the direction of travel turns 2 times as much as yaw; has",
+    ),
+    "bursts": (
+        bursts,
+        ", lines 2 to 302: rows come in bursts, most of them 0.001 s after the row "
+        "before and the others 0.5 s; log when a row was measured",
     ),
     "missing": (
         lambda c: c.pop("yaw"),
@@ -479,6 +498,27 @@ def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, messa
     monkeypatch.chdir(tmp_path)
     (tmp_path / "notes.txt").write_text("")
     assert message in refusal(path)
+
+
+def test_files_that_are_left_out_are_named_in_a_line(tmp_path):
+    write_csv(tmp_path / "a.csv", recorded_run())
+    assert not [line for line in read(tmp_path)[1] if "left out" in line]
+    for name in ("b.csv.gz", "c.txt", "d.log", ".hidden.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (line,) = [line for line in read(tmp_path)[1] if "left out" in line]
+    assert line == (
+        f"warning: {tmp_path}: 3 files are left out, since they are no .csv, .npz, "
+        ".parquet: b.csv.gz, c.txt, d.log"
+    )
+
+
+@pytest.mark.parametrize(("most", "said"), [(0.03, False), (0.06, True)])
+def test_times_that_jitter_are_uneven(tmp_path, most, said):
+    columns = recorded_run()
+    delays = np.random.default_rng(0).uniform(0.0, most, 301)
+    columns["t"] = columns["t"] + delays
+    _, lines = read(write_csv(tmp_path / "a.csv", columns))
+    assert any("uneven sampling" in line for line in lines) == said
 
 
 def test_contents_decide_which_data_set_it_is(tmp_path):

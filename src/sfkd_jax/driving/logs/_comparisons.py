@@ -30,6 +30,8 @@ change the gain by less.
 """
 OTHER_UNIT = 20.0
 """Ratio of the values of two runs from which on they are in different units."""
+PLACEHOLDERS = (99.0, 999.0, 9999.0, 99999.0, 32767.0, 32768.0, 65535.0)
+"""Sizes of numbers that loggers write where there is no value."""
 NEVER_NEGATIVE = (FRICTION, MASS)
 """Roles of entries of e that cannot be below 0."""
 BEYOND = 30.0
@@ -47,6 +49,8 @@ def compare(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     steering, acceleration = checks.columns.control
     yield from _odd_gains(logs, turns, steering, yaw)
     yield from _odd_gains(logs, _accelerations, acceleration, speed)
+    for k, name in enumerate(checks.columns.control):
+        yield from _placeholders(logs, [log.controls[:, k] for log in logs], name)
     size = logs[0].envs.shape[1]
     names = checks.columns.environment
     if len(names) != size:
@@ -144,7 +148,7 @@ def _odd_units(
 
 
 def _placeholders(
-    logs: list[Log], channel: Sequence[Values], name: str, role: str
+    logs: list[Log], channel: Sequence[Values], name: str, role: str | None = None
 ) -> Iterator[Finding]:
     """Find a number that stands for a missing one, such as 9999, or a friction of -1.
 
@@ -152,12 +156,17 @@ def _placeholders(
         logs: the runs.
         channel: its values in each run.
         name: of the channel.
-        role: of the entry of e, see `plants.roles_of`.
+        role: of the entry of e, see `plants.roles_of`; None for a command. A command
+            may be much larger once, so that only usual placeholders are found.
     """
     sizes = np.abs(np.concatenate(channel))
     largest = float(sizes.max())
     others = float(sizes[sizes < largest].max(initial=0.0))
     beyond = 0.0 < BEYOND * others < largest
+    beyond &= role is not None or largest in PLACEHOLDERS
+    hint = "; leave the cell empty where nothing was measured"
+    if role is not None:
+        hint += ", or pass environment.low and environment.high"
     for log, values in zip(logs, channel, strict=True):
         odd = np.abs(values) == largest if beyond else np.zeros(len(values), dtype=bool)
         # A run that has one value throughout has been measured so.
@@ -168,6 +177,5 @@ def _placeholders(
             log,
             odd,
             lambda k, values=values: f"{name} is {values[k]:.4g}, not a measured value",
-            hint="; leave the cell empty where nothing was measured, or pass "
-            "environment.low and environment.high",
+            hint=hint,
         )

@@ -14,7 +14,7 @@ from sfkd_jax.driving.logs._checks import Bounds, Checks
 from sfkd_jax.driving.logs._command_lags import CommandLag, command_lags
 from sfkd_jax.driving.logs._findings import Finding
 from sfkd_jax.driving.logs._joint_checks import check_together
-from sfkd_jax.driving.logs._log_files import log_files
+from sfkd_jax.driving.logs._log_files import SUFFIXES, left_out, log_files
 from sfkd_jax.driving.logs._logs import Columns, Log
 from sfkd_jax.driving.logs._reading import read_logs
 from sfkd_jax.driving.logs._segments import Piece, assign_parts, pieces, segments
@@ -26,6 +26,8 @@ MOST_LINES = 20
 """Number of warnings that are reported in full; further ones are only counted. The same
 holds for reasons to refuse the logs.
 """
+FEW = 5
+"""Number of files that a line names."""
 Coverage: TypeAlias = dict[str, dict[str, dict[str, float]]]
 """`coverage` of every channel by its name, in the groups "state", "control" and
 "environment".
@@ -148,6 +150,12 @@ def _checked_logs(
         needs_environment=needs_environment,
         blanks=checks.drop_missing,
     )
+    if others := left_out(path):
+        names = ", ".join(others[:FEW]) + (", …" if len(others) > FEW else "")
+        report(
+            f"warning: {path}: {len(others)} files are left out, since they are no "
+            f"{', '.join(SUFFIXES)}: {names}"
+        )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
     logs, findings = checks.apply(recorded)
