@@ -43,7 +43,8 @@ PLANT = ROAD | {"driving.plants", "driving.scenarios"}
 DRIVING = {
     "driving": set(),
     "driving.path_coordinates": {"types", "geometry"},
-    "driving.paths": {"types"},
+    "driving.smoothing": set(),
+    "driving.paths": {"types", "driving.smoothing"},
     "driving.lanes": {"types", "geometry", "driving.paths"},
     "driving.plants": ROAD,
     "driving.scenarios": ROAD,
@@ -67,7 +68,7 @@ APPLICATIONS = {
     "policy": PARTS | {"assembly"},
     "export": ROAD
     | {"assembly", "policy", "settings", "store"}
-    | {"certificate", "driving.certificate"},
+    | {"certificate", "driving.certificate", "driving.path_following"},
     "adapters": PLANT | {"assembly"},
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}
@@ -97,6 +98,9 @@ THIRD_PARTY = {
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
     "driving.path_coordinates": {"numpy"},
+    "driving.smoothing": {"numpy", "scipy"},
+    "driving.paths": {"numpy"},
+    "driving.lanes": {"numpy"},
     "driving.plants": {"numpy"},
     "driving.path_following": {"numpy"},
     "driving.drives": {"numpy"},

@@ -4,6 +4,7 @@ import os
 import runpy
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -13,7 +14,6 @@ import numpy as np
 import pytest
 
 import sfkd_jax
-from sfkd_jax.driving import plants
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -140,16 +140,24 @@ class Message(SimpleNamespace):
         return getattr(self, name)
 
 
-@pytest.fixture(scope="module")
-def shipped():
-    """The shipped policy that the node takes by default, compiled once."""
-    policy = sfkd_jax.load("kinematic_path")
+DEFAULT = "kinematic_path"
+"""The policy that the node takes unless it is told another one."""
+
+
+@cache
+def shipped(name):
+    """A policy that ships, compiled once; those in the world with fewer samples."""
+    policy = sfkd_jax.load(name)
+    if name in ("kinematic", "dynamic"):
+        chosen = dict(policy.settings["controller"])
+        chosen["mppi"] = {**chosen["mppi"], "num_samples": 100}
+        policy = sfkd_jax.load(name, controller=chosen)
     return policy, sfkd_jax.warm_up(policy)
 
 
 @pytest.fixture
-def node(monkeypatch, shipped):
-    """The example's node."""
+def make_node(monkeypatch):
+    """(name of a policy) -> the example's node."""
     modules = {"rclpy": {}, "rclpy.node": {"Node": StubNode}}
     for name, entry in (
         ("ackermann_msgs", "AckermannDriveStamped"),
@@ -161,19 +169,33 @@ def node(monkeypatch, shipped):
         module = ModuleType(name)
         module.__dict__.update(entries)
         monkeypatch.setitem(sys.modules, name, module)
-    policy, act = shipped
-    monkeypatch.setattr(sfkd_jax, "load", {"kinematic_path": policy}.__getitem__)
-    monkeypatch.setattr(sfkd_jax, "warm_up", lambda _: act)
-    source = EXAMPLES / "ros2" / "controller_node.py"
-    return runpy.run_path(str(source))["ControllerNode"]()
+    source = runpy.run_path(str(EXAMPLES / "ros2" / "controller_node.py"))
+
+    def make(name):
+        policy, act = shipped(name)
+        monkeypatch.setattr(sfkd_jax, "load", {name: policy}.__getitem__)
+        monkeypatch.setattr(sfkd_jax, "warm_up", lambda _: act)
+        source["PARAMETERS"]["policy"] = name
+        return source["ControllerNode"]()
+
+    assert source["PARAMETERS"]["policy"] == DEFAULT
+    return make
+
+
+@pytest.fixture
+def node(make_node):
+    """The example's node as it is."""
+    return make_node(DEFAULT)
 
 
 def odometry_of(state):
-    x, y, yaw, v = map(float, state)
+    """A message with the first states of a car; further ones than four may follow."""
+    x, y, yaw, v, side, turning = map(float, [*state, 0.0, 0.0][:6])
     odometry = Message()
     turn = Message(w=np.cos(yaw / 2), x=0.0, y=0.0, z=np.sin(yaw / 2))
     odometry.pose.pose = Message(position=Message(x=x, y=y), orientation=turn)
-    odometry.twist.twist = Message(linear=Message(x=v, y=0.0), angular=Message(z=0.0))
+    twist = Message(linear=Message(x=v, y=side), angular=Message(z=turning))
+    odometry.twist.twist = twist
     return odometry
 
 
@@ -184,8 +206,9 @@ def path_of(points):
 
 def drive(node, state, steps, *, origin=(0.0, 0.0)):
     """Drive the car that the policy was trained on, a tick of the node a step."""
-    step = jax.jit(plants.kinematic().step)
-    offset = np.array([*origin, 0.0, 0.0])
+    step = jax.jit(node.policy.vehicle.step)
+    offset = np.zeros(len(state))
+    offset[:2] = origin
     for _ in range(steps):
         node.on_odometry(odometry_of(state + offset))
         node.plan()
@@ -240,6 +263,23 @@ def test_the_ros_node_starts_from_standstill_and_again_after_a_gap(node):
     assert drive(node, state, 30)[3] > 3.0
 
 
+@pytest.mark.parametrize("name", sfkd_jax.policies())
+def test_the_ros_node_drives_with_every_policy_that_ships(make_node, name):
+    """From rest, round a bend of 60 m radius, on poses with centimetres of noise."""
+    node = make_node(name)
+    node.parameters["speed"] = 5.0
+    angles = np.arange(0.0, 1.5, 0.5 / 60.0)
+    bend = 60.0 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
+    bend += 0.02 * np.random.default_rng(0).standard_normal(bend.shape)
+    node.on_path(path_of(bend))
+    node.on_road(Message(data=[0.8, 0.0]))
+    state = drive(node, np.zeros(len(node.policy.vehicle.states)), 60)
+    assert node.log == []
+    assert state[3] > 4.0
+    assert np.hypot(state[0], state[1] - 60.0) == pytest.approx(60.0, abs=0.3)
+    assert state[0] > 10.0
+
+
 def test_the_ros_node_follows_a_path_in_coordinates_of_a_map(node):
     origin = (5e5, 4.5e6)
     ready(node, origin=origin)
@@ -257,7 +297,8 @@ LINE = [(0.0, 0.0), (9.0, 0.0)]
     [
         ("path", path_of([])),
         ("path", path_of(LINE[:1])),
-        ("path", path_of([*LINE, LINE[1]])),
+        ("path", path_of([LINE[0], LINE[0]])),
+        ("path", path_of([*LINE, (9.0, 9.0)])),
         ("path", path_of([LINE[0], (np.nan, 0.0)])),
         ("path", path_of([LINE[0], (0.1, 0.0)])),
         ("road", Message(data=[0.8])),
@@ -278,6 +319,12 @@ def test_the_ros_node_refuses_a_message_in_a_line_and_keeps_the_last(
     (line,) = node.log
     assert line.startswith(f"{topic} refused")
     assert "\n" not in line
+
+
+def test_the_ros_node_takes_poses_that_are_there_twice(node):
+    node.on_path(path_of([LINE[0], *LINE, LINE[1]]))
+    assert node.log == []
+    np.testing.assert_allclose(node.path.points[-1], [9.0, 0.0, 0.0, 0.0], atol=1e-5)
 
 
 def test_samples_and_vehicles_spread_over_four_devices_give_the_same_controls():

@@ -26,6 +26,7 @@ from sfkd_jax.info import Reason
 PARAMETERS = {
     "policy": "kinematic_path",  # the name of one that ships, or a run directory
     "speed": 10.0,  # wanted [m/s]
+    "tolerance": 0.05,  # by which the path may be beside the poses, RMS [m]
     "timeout": 0.3,  # age at which an odometry message is too old [s]
     "patience": 5,  # control steps without usable inputs before braking
     "seed": 0,
@@ -51,8 +52,8 @@ class ControllerNode(Node):
         for name, value in PARAMETERS.items():
             self.declare_parameter(name, value)
         self.policy = sfkd_jax.load(self.setting("policy"))
-        self.dt = self.policy.settings["vehicle"]["dt"]
-        self.horizon = self.policy.settings["controller"]["mppi"]["horizon"]
+        self.dt = self.policy.vehicle.dt
+        self.horizon = self.policy.interface["horizon"]
         self.act = sfkd_jax.warm_up(self.policy)
         key = jax.random.key(self.setting("seed"))
         self.start = self.memory = self.policy.controller.init(key)
@@ -65,6 +66,7 @@ class ControllerNode(Node):
         self.seen = -math.inf  # when the last odometry message came [s]
         self.progress = jnp.zeros(())  # arc length along the path [m]
         self.blind = 0  # control steps since the inputs were usable
+        self.steering = 0.0  # that was sent last [rad]
 
         self.create_subscription(Odometry, "odometry", self.on_odometry, 1)
         self.create_subscription(Path, "path", self.on_path, 1)
@@ -76,6 +78,16 @@ class ControllerNode(Node):
         """Return the value of a parameter."""
         return self.get_parameter(name).value
 
+    @property
+    def largest_curvature(self) -> float | None:
+        """Largest curvature of the class of the policy at the speed [1/m]; or None."""
+        certificate = self.policy.certificate
+        if certificate is None or certificate.corridor is None:
+            return None
+        kind = certificate.corridor.conditions
+        by_speed = kind.lateral_acceleration / self.setting("speed") ** 2
+        return min(kind.peak_curvature, by_speed)
+
     def refuse(self, topic: str, reason: object) -> None:
         """Say why a message is not used. An exception would end the node."""
         self.get_logger().warning(f"{topic} refused, the last one is kept: {reason}")
@@ -84,7 +96,8 @@ class ControllerNode(Node):
         """Take position, yaw and forward speed.
 
         The further states of a dynamic model follow in its own order: side speed, yaw
-        rate, and the steering angle, which odometry does not have.
+        rate, and the steering angle. Odometry does not have the latter; it is near the
+        one that was sent last.
         """
         pose = message.pose.pose
         twist = message.twist.twist
@@ -97,7 +110,7 @@ class ControllerNode(Node):
             twist.linear.x,
             twist.linear.y,
             twist.angular.z,
-            0.0,
+            self.steering,
         ]
         odometry = np.asarray(state[: len(self.policy.vehicle.state_names)])
         if not np.all(np.isfinite(odometry)):
@@ -107,15 +120,24 @@ class ControllerNode(Node):
         self.seen = time.monotonic()
 
     def on_path(self, message: Path) -> None:
-        """Take a new path, which starts at its first point."""
+        """Take a new path, which starts at its first point.
+
+        Planners repeat poses, such as the goal: only one of them counts.
+        """
         positions = [pose.pose.position for pose in message.poses]
-        if len(positions) < 2:
-            self.refuse("path", f"a path needs two poses or more, got {len(positions)}")
-            return
         points = np.asarray([[position.x, position.y] for position in positions])
+        points = points.reshape(-1, 2)
+        points = points[np.any(np.diff(points, axis=0, prepend=np.nan) != 0.0, axis=1)]
+        if len(points) < 2:
+            self.refuse("path", f"it needs two different poses, got {len(points)}")
+            return
         _, near, origin = sfkd_jax.relative(points[0], points)
         try:
-            self.path = path_through(jnp.asarray(near))
+            self.path = path_through(
+                jnp.asarray(near),
+                tolerance=self.setting("tolerance"),
+                curvature=self.largest_curvature,
+            )
         except ValueError as reason:
             self.refuse("path", reason)
             return
@@ -168,9 +190,10 @@ class ControllerNode(Node):
 
     def publish(self, control) -> None:
         """Send steering angle [rad] and acceleration [m/s²]."""
+        self.steering = float(control[0])
         message = AckermannDriveStamped()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.drive.steering_angle = float(control[0])
+        message.drive.steering_angle = self.steering
         message.drive.acceleration = float(control[1])
         self.commands.publish(message)
 

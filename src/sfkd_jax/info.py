@@ -249,8 +249,10 @@ class LaneInfo(NamedTuple):
     Attributes:
         reference: the window that is followed, (horizon, 4).
         offset: of the reference from the centre line [m].
-        clearance: distance from all obstacles along the whole committed reference [m];
-            NaN where no bound holds.
+        clearance: distance from all obstacles along the whole committed reference [m],
+            except for those who follow; NaN where no bound holds.
+        edge: what the edges of the lane leave beyond what is needed, along the whole
+            committed reference [m]; negative where the lane is too narrow.
         admissible: whether the committed reference is free, and inside class and lane.
         stopping: whether it ends at rest.
         evading: whether it is outside the class.
@@ -259,6 +261,7 @@ class LaneInfo(NamedTuple):
     reference: Float[Array, "horizon 4"]
     offset: Scalar
     clearance: Scalar
+    edge: Scalar
     admissible: Flag
     stopping: Flag
     evading: Flag

@@ -106,11 +106,23 @@ def test_a_wrong_option_is_refused_by_name(override, says):
             ["dataset=files", "dataset.path=x", "environment=estimated"],
             "logs train none; pass environment.source=measured or none",
         ),
+        (["environment.roles=[friction]"], "environment.roles needs one of friction,"),
+        (["environment.roles=[friction,friction]"], "and friction once at most"),
+        (["environment.roles=[friction,gust]"], "got friction, gust"),
     ],
 )
 def test_an_environment_that_nobody_can_learn_of_is_refused(overrides, says):
     with pytest.raises(ValueError, match=says):
         settings(*overrides)
+
+
+def test_what_an_entry_of_e_is_can_be_stated_and_is_read_from_known_names_alone():
+    stated = settings("environment.roles=[side_force,friction]").environment
+    assert plants.roles_of(("w", "mu"), stated.roles) == ("side_force", "friction")
+    assert settings().environment.roles == ()
+    names = ("friction [-]", "lateral wind [m/s]", "mass [kg]", "slope", "grip")
+    known = ("friction", "side_force", "mass", "other", "other")
+    assert plants.roles_of(names) == known
 
 
 def test_a_root_may_begin_at_home():

@@ -57,6 +57,9 @@ def build_in_lane(
     admissible = _admissible_references(plant, law, certificate, car)
     manoeuvres = path_following.Manoeuvres(kind=admissible, dt=plant.dt)
     options = {**REFERENCE_SEARCH, **REFERENCE_PLANNERS.get(planner, {})}
+    grip: dict[str, Any] = {}
+    if friction is not None:
+        grip["lowest"] = certificate.measured.boxes.env[0][friction]
     speed_gain = float(np.mean(law.gain[..., 1, PATH_SPEED]))
     return path_following.in_lane(
         inner=inner,
@@ -65,7 +68,7 @@ def build_in_lane(
         horizon=horizon,
         lead=0.0 if plant.speed_loop else 1.0 / speed_gain,
         friction=friction,
-        lowest=certificate.measured.boxes.env[0][friction or 0],
+        **grip,
     )
 
 

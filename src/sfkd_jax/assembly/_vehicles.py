@@ -66,7 +66,7 @@ class OwnVehicleSettings(VehicleSettings):
 _KNOWN_FROM_VEHICLE = ("dt", "wheelbase", "limits", "needs_environment", "report")
 takes_logs = takes(
     from_logs,
-    skip=(*_KNOWN_FROM_VEHICLE, "env_low", "env_high"),
+    skip=(*_KNOWN_FROM_VEHICLE, "env_low", "env_high", "env_roles"),
     columns=schema("Columns", object, Columns),
 )
 """Makes a class a dataclass with the arguments of `logs.from_logs`."""

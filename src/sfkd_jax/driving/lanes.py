@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.driving.paths import Path
@@ -35,8 +36,8 @@ class Obstacles(NamedTuple):
 
     Attributes:
         position: of the centres [m], (obstacle, step, 2). An obstacle that stands still
-            has one step. Others have predicted positions at 0, dt, 2 dt, … and stay at
-            the last one.
+            has one step. Others have predicted positions at 0, dt, 2 dt, … and go on
+            from the last one with their last velocity.
         yaw: of the boxes [rad], (obstacle,).
         half: half of length and width [m], (obstacle, 2).
         radius: added all around a box [m], (obstacle,).
@@ -82,28 +83,47 @@ def circles(
     )
 
 
-def padded(obstacles: Obstacles, count: int) -> Obstacles:
+def padded(obstacles: Obstacles, count: int, steps: int | None = None) -> Obstacles:
     """Return obstacles in a fixed number of rows, of which the last are not present.
 
-    A compiled program is made for one number of rows, and compiled anew for another.
+    A compiled program is made for one number of rows and of predicted positions, and
+    compiled anew for another. Concrete arrays are padded on the host, where nothing is
+    compiled.
 
     Args:
         obstacles: any number of them, also none.
         count: number of rows.
+        steps: number of predicted positions of each; None for as many as there are. An
+            obstacle goes on with its last velocity, as it would without the padding.
 
     Raises:
-        ValueError: there are more obstacles than rows.
+        ValueError: there are more obstacles than rows, or more positions than steps.
     """
-    rows = obstacles.position.shape[0]
+    rows, known = obstacles.position.shape[:2]
+    steps = known if steps is None else steps
     if rows > count:
         raise ValueError(f"{rows} obstacles do not fit in {count} rows: pass more rows")
+    if known > steps:
+        raise ValueError(
+            f"{known} predicted positions do not fit in {steps} steps: pass more steps"
+        )
+    tracer: Any = jax.core.Tracer  # pyright: ignore
+    traced = any(isinstance(leaf, tracer) for leaf in obstacles)
+    # Of either package; pyright knows none that is both.
+    xp: Any = jnp if traced else np
 
-    def with_zeros(leaf: Array) -> Array:
-        zeros = jnp.zeros((count - rows, *leaf.shape[1:]), leaf.dtype)
-        return jnp.concatenate([leaf, zeros])
+    def with_zeros(leaf: Any) -> Any:
+        leaf = xp.asarray(leaf)
+        zeros = xp.zeros((count - rows, *leaf.shape[1:]), leaf.dtype)
+        return xp.concatenate([leaf, zeros])
 
     # Of `present`, 0 is False.
-    return Obstacles(*map(with_zeros, obstacles))
+    wide = Obstacles(*map(with_zeros, obstacles))
+    last = wide.position[:, -1:]
+    velocity = last - wide.position[:, -2:-1] if known > 1 else xp.zeros_like(last)
+    later = xp.arange(1, steps - known + 1, dtype=last.dtype)[:, None]
+    position = xp.concatenate([wide.position, last + later * velocity], axis=1)
+    return Obstacles(*map(jnp.asarray, wide._replace(position=position)))
 
 
 def clearance(
@@ -144,9 +164,10 @@ def place_at(
     if last == 0:
         # An obstacle that stands still is not looked up for every sample.
         return places[0, 0], places[0, 1]
-    step = jnp.clip(step, 0.0, last)
-    index = jnp.floor(step).astype(int)
-    moves = jnp.diff(places, axis=0, append=places[-1:])
+    step = jnp.maximum(step, 0.0)
+    # Beyond the last position the share is above 1: the last move goes on.
+    index = jnp.clip(jnp.floor(step), 0, last - 1).astype(int)
+    moves = jnp.diff(places, axis=0)
     columns = (*places.T, *moves.T)
     x, y, dx, dy = (column.at[index].get(mode="clip") for column in columns)
     share = step - index

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from sfkd_jax.driving.smoothing import smooth
 from sfkd_jax.types import Reference, Scalar
 
 SPACING = 0.5
@@ -53,24 +56,39 @@ def path_from_curvature(curvature: Float[Array, " point"], *, spacing: float) ->
 
 
 def path_through(
-    points: Float[Array, "point 2"], *, spacing: float = SPACING, closed: bool = False
+    points: Float[Array, "point 2"],
+    *,
+    spacing: float = SPACING,
+    closed: bool = False,
+    tolerance: float = 0.0,
+    curvature: float | None = None,
 ) -> Path:
     """Return a path through positions, resampled at equal distances.
 
-    Yaw and curvature are central differences. The path is straight between positions,
-    so these should be dense: several per `spacing` on a sharp turn. An open path is cut
-    to a multiple of `spacing`. A closed path keeps its length and changes its spacing.
+    Without a tolerance the path is straight between positions, and yaw and curvature
+    are central differences. The positions should then be exact and dense: several per
+    `spacing` on a sharp turn. With a tolerance it is the smoothest path beside them, in
+    the sense of the smallest ∫ |d³p/ds³|² ds (Reinsch, Numerische Mathematik 10, 1967).
+
+    An open path is cut to a multiple of `spacing`. A closed path keeps its length and
+    changes its spacing.
 
     Args:
         points: positions [m].
         spacing: between samples [m].
         closed: whether the last position leads back to the first, which need not be
             repeated. The path is then a `Lap`.
+        tolerance: root mean square distance of the positions from the path [m]: the
+            noise of recorded positions, or how far beside way-points the path may be.
+        curvature: largest one that is accepted [1/m], such as that of the class of a
+            policy; None for any.
 
     Raises:
-        ValueError: a position is not finite, two consecutive ones are the same, or the
-            path is shorter than two spacings.
+        ValueError: a position is not finite, two consecutive ones are the same, the
+            path is shorter than two spacings, or it asks for a larger curvature.
     """
+    if not 0.0 <= tolerance < math.inf:
+        raise ValueError(f"tolerance must be 0 or more, in metres, got {tolerance}")
     if closed and bool(jnp.any(points[0] != points[-1])):
         points = jnp.concatenate([points, points[:1]])
     steps = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
@@ -86,6 +104,34 @@ def path_through(
             f"a path of {float(along[-1]):.3g} m has too few samples "
             f"at a spacing of {spacing} m"
         )
+    if tolerance > 0.0:
+        positions = np.asarray(points, np.float64)
+        samples, spacing = smooth(positions, spacing, closed, tolerance)
+        kind = Lap if closed else Path
+        distance = jnp.asarray(spacing, dtype=float)
+        path = kind(jnp.asarray(samples, dtype=float), distance)
+    else:
+        path = _straight(points, along, spacing, closed)
+    if curvature is not None:
+        _check_curvature(path, curvature, tolerance)
+    return path
+
+
+def _straight(
+    points: Float[Array, "point 2"],
+    along: Float[Array, " point"],
+    spacing: float,
+    closed: bool,
+) -> Path:
+    """Return a path that is straight between positions.
+
+    Args:
+        points: positions [m].
+        along: way to each position [m].
+        spacing: between samples [m].
+        closed: whether the last position is the first one.
+    """
+    count = int(along[-1] / spacing) + 1
     if closed:
         spacing = float(along[-1]) / (count - 1)
     s = jnp.arange(count) * spacing
@@ -104,6 +150,19 @@ def path_through(
     if closed:
         return Lap(samples[2:-2], jnp.asarray(spacing))
     return Path(samples, jnp.asarray(spacing))
+
+
+def _check_curvature(path: Path, largest: float, tolerance: float) -> None:
+    """Raise a ValueError if a path has a larger curvature somewhere."""
+    bends = np.abs(np.asarray(path.points[:, 3]))
+    worst = int(np.argmax(bends))
+    if bends[worst] <= largest:
+        return
+    noisy = "" if tolerance else "; noisy or sparse positions need a tolerance [m]"
+    raise ValueError(
+        f"the path asks for a curvature of {bends[worst]:.3g} 1/m at "
+        f"{worst * float(path.spacing):.4g} m, {largest:.3g} is the largest{noisy}"
+    )
 
 
 def point_at(path: Path, s: Scalar) -> Float[Array, " 4"]:

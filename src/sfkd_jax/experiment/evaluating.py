@@ -18,6 +18,7 @@ from jaxtyping import Array
 from sfkd_jax import assembly, policy, store
 from sfkd_jax.assembly import ScenarioSettings, System
 from sfkd_jax.driving import simulation
+from sfkd_jax.driving.plants import FRICTION, roles_of
 from sfkd_jax.driving.scenarios import COURSES, Scenario
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
@@ -271,6 +272,9 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
             f"scenario={run.settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
         )
+    environment = run.settings.environment
+    names = [entry.label for entry in run.plant.environment]
+    roles = roles_of(environment.names or names, environment.roles)
     return assembly.build_in_lane(
         inner,
         run.plant,
@@ -279,7 +283,7 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
         horizon=_preview(run),
         car=run.plant.size,
         planner="mppi",
-        friction=0,
+        friction=roles.index(FRICTION) if FRICTION in roles else None,
     )
 
 

@@ -59,6 +59,7 @@ def read(
         needs_environment=environment.is_known,
         limits=(plant.control_low or None, plant.control_high or None),
         **environment.box,
+        env_roles=environment.roles,
         **options,
     )
 

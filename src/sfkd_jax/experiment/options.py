@@ -19,7 +19,7 @@ from sfkd_jax.assembly import (
 from sfkd_jax.certification import measure, prove
 from sfkd_jax.driving import drives, simulation
 from sfkd_jax.driving.corridor import measure_corridor
-from sfkd_jax.driving.plants import KNOWN_STATES, Vehicle, described
+from sfkd_jax.driving.plants import KNOWN_STATES, Vehicle, described, roles_of
 from sfkd_jax.driving.scenarios import DriveClass
 from sfkd_jax.latency import Latency
 from sfkd_jax.ranges import (
@@ -52,6 +52,8 @@ class EnvironmentSettings:
         low: lower corner of the box E; None for that of recorded logs.
         high: upper corner of E.
         names: names of the entries of e, with units; () for friction and lateral wind.
+        roles: what each entry is, one of friction, mass, side_force, other; () for what
+            its name says.
         source: "measured", "estimated" while driving, or "none": e is not observed.
     """
 
@@ -59,6 +61,7 @@ class EnvironmentSettings:
     low: Bounds | None = None
     high: Bounds | None = None
     names: Names = ()
+    roles: Names = ()
     source: Annotated[str, OneOf(assembly.ENV_SOURCES)] = "measured"
 
     @property
@@ -378,3 +381,6 @@ def _check_env_names(environment: EnvironmentSettings) -> None:
             f"environment.low and environment.high need {len(names)} entries, "
             f"for {', '.join(names)}"
         )
+    if environment.roles and (names or environment.low):
+        # Entries without names are only counted.
+        roles_of(names or tuple(map(str, environment.low or ())), environment.roles)

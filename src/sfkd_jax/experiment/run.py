@@ -157,4 +157,6 @@ class Run:
                 low, high = boxes_of(dataset).control
                 vehicle["control_low"] = list(low)
                 vehicle["control_high"] = list(high)
+        if roles := self.settings.environment.roles:
+            recorded["environment"]["roles"] = list(roles)
         return recorded

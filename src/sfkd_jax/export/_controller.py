@@ -19,6 +19,7 @@ from jaxtyping import Array
 from sfkd_jax import policy, store
 from sfkd_jax.certificate import write
 from sfkd_jax.driving.lanes import Lane, Obstacles
+from sfkd_jax.driving.path_following import moved_on
 from sfkd_jax.driving.paths import Path as Road
 from sfkd_jax.policy import Policy
 from sfkd_jax.ranges import MayBeEmpty, Names, Positive
@@ -301,12 +302,9 @@ def in_window(
         params: Any, state: Any, observation: Any, env: Any, *ahead: Array
     ) -> tuple[Any, Any, Any]:
         road, spacing, left, right, speed, *obstacles, moved = ahead
-        scene = Lane(Road(road, spacing), left, right, speed), Obstacles(*obstacles)
-        state = state._replace(
-            progress=state.progress - spacing * moved,
-            # Along the window of this step.
-            committed=state.committed._replace(index=state.committed.index - moved),
-        )
+        window = Road(road, spacing)
+        scene = Lane(window, left, right, speed), Obstacles(*obstacles)
+        state = moved_on(state, window, moved)
         return driver.act(params, state, observation, env, scene)
 
     dtypes = {"present": bool, "moved": jnp.int32}

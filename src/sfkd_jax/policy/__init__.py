@@ -16,7 +16,9 @@ import jax.numpy as jnp
 from sfkd_jax import assembly, store
 from sfkd_jax.certificate import describe_signature
 from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.lanes import padded
 from sfkd_jax.driving.path_following import in_the_world
+from sfkd_jax.driving.plants import FRICTION, roles_of
 from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
@@ -100,7 +102,11 @@ class Policy(TrainedModel):
             return _entrance(self.around(planner=planner), self)
 
     def in_lane(
-        self, *, car: tuple[float, float] | None = None, planner: str = "mppi"
+        self,
+        *,
+        car: tuple[float, float] | None = None,
+        planner: str = "mppi",
+        capacity: tuple[int, int] | None = None,
     ) -> Controller:
         """Return a controller that drives in a lane, round obstacles, see `InLane`.
 
@@ -110,6 +116,10 @@ class Policy(TrainedModel):
             car: length and width [m], by default those of the vehicle; its middle is
                 the observed position.
             planner: name of the planner that searches for a reference, "mppi" or "cem".
+            capacity: largest number of obstacles, and of predicted positions of each.
+                `act` is then to be called as it is, from the host: it takes any number
+                of obstacles up to these, and is compiled once. With None it is a pure
+                function, for `jax.jit` and scans, of one number of obstacles each.
 
         Raises:
             ValueError: the policy has no certified corridor.
@@ -118,8 +128,10 @@ class Policy(TrainedModel):
         law = self.law
         # A corridor is about path coordinates, and these about a law.
         assert law is not None
-        names = self.interface["environment"]["names"]
-        friction = [i for i, name in enumerate(names) if name.startswith("friction")]
+        roles = roles_of(
+            self.interface["environment"]["names"],
+            self.settings["environment"].get("roles", ()),
+        )
         with jax.ensure_compile_time_eval():
             controller = assembly.build_in_lane(
                 self.controller,
@@ -129,8 +141,10 @@ class Policy(TrainedModel):
                 horizon=self.interface["horizon"],
                 car=car or self.vehicle.size,
                 planner=planner,
-                friction=friction[0] if friction else None,
+                friction=roles.index(FRICTION) if FRICTION in roles else None,
             )
+        if capacity is not None:
+            controller = _with_capacity(controller, capacity)
         return _in_policy_numerics(controller)
 
     def __reduce__(self) -> Any:
@@ -289,6 +303,29 @@ def _check_env_source(env_source: str, reads_env: bool) -> None:
             f"env_source must be {' or '.join(sources)} for a policy that "
             f"{'reads' if reads_env else 'ignores'} the environment, got {env_source!r}"
         )
+
+
+def _with_capacity(controller: Controller, capacity: tuple[int, int]) -> Controller:
+    """Return a controller in a lane that is compiled once for all numbers of obstacles.
+
+    Args:
+        controller: in a lane.
+        capacity: number of obstacles, and of predicted positions of each.
+    """
+    if len(capacity) != 2 or min(capacity) < 1:
+        raise ValueError(
+            "capacity must be (obstacles, predicted positions), both 1 or more, "
+            f"got {capacity}"
+        )
+    compiled = jax.jit(controller.act)
+
+    @wraps(controller.act)
+    def act(params: Params, state: Any, observation: Any, env: Any, scene: Any) -> Any:
+        lane, obstacles = scene
+        rows = padded(obstacles, *capacity)
+        return compiled(params, state, observation, env, (lane, rows))
+
+    return Controller(jax.jit(controller.init), act)
 
 
 def _in_policy_numerics(controller: Controller) -> Controller:

@@ -221,6 +221,12 @@ def stale(columns):
     columns.update({name: columns[name][held] for name in ("p_x", "p_y")})
 
 
+def bursts(columns):
+    """Five rows at a time, stamped on arrival 1 ms apart."""
+    rows = np.arange(301)
+    columns["t"] = 0.5 * (rows // 5) + 1e-3 * (rows % 5)
+
+
 def late(names, steps):
     """The columns come some rows after the others."""
 
@@ -343,6 +349,19 @@ WRONG = {
     "no wind": (
         change("wind", slice(100, 105), 9999.0),
         ", line 102: wind is 9999, not a measured value (5 rows like this)",
+    ),
+    "no steering": (
+        change("steering", slice(100, 105), -9999.0),
+        ", line 102: steering is -9999, not a measured value (5 rows like this); leave",
+    ),
+    "a yaw of half its size": (
+        scale("yaw", lambda yaw: 0.5 * yaw),
+        ", lines 2 to 302: the direction of travel turns 2 times as much as yaw; has",
+    ),
+    "bursts": (
+        bursts,
+        ", lines 2 to 302: rows come in bursts, most of them 0.001 s after the row "
+        "before and the others 0.5 s; log when a row was measured",
     ),
     "missing": (
         lambda c: c.pop("yaw"),
@@ -481,6 +500,27 @@ def test_a_path_that_means_no_logs_is_refused(tmp_path, monkeypatch, path, messa
     assert message in refusal(path)
 
 
+def test_files_that_are_left_out_are_named_in_a_line(tmp_path):
+    write_csv(tmp_path / "a.csv", recorded_run())
+    assert not [line for line in read(tmp_path)[1] if "left out" in line]
+    for name in ("b.csv.gz", "c.txt", "d.log", ".hidden.txt"):
+        (tmp_path / name).write_bytes(b"")
+    (line,) = [line for line in read(tmp_path)[1] if "left out" in line]
+    assert line == (
+        f"warning: {tmp_path}: 3 files are left out, since they are no .csv, .npz, "
+        ".parquet: b.csv.gz, c.txt, d.log"
+    )
+
+
+@pytest.mark.parametrize(("most", "said"), [(0.03, False), (0.06, True)])
+def test_times_that_jitter_are_uneven(tmp_path, most, said):
+    columns = recorded_run()
+    delays = np.random.default_rng(0).uniform(0.0, most, 301)
+    columns["t"] = columns["t"] + delays
+    _, lines = read(write_csv(tmp_path / "a.csv", columns))
+    assert any("uneven sampling" in line for line in lines) == said
+
+
 def test_contents_decide_which_data_set_it_is(tmp_path):
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
@@ -612,6 +652,32 @@ def test_a_wind_that_is_constant_in_every_run_is_no_missing_value(tmp_path):
         write_csv(tmp_path / f"{number}.csv", columns)
     dataset = read(tmp_path)[0].dataset
     np.testing.assert_array_equal(dataset.env_low[1], -6.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "refused"),
+    [
+        ("friction", None, True),
+        ("friction", "other", False),
+        ("grip", None, False),
+        ("grip", "friction", True),
+        ("load", "mass", True),
+    ],
+)
+def test_what_cannot_be_negative_is_stated_and_not_read_from_a_name(
+    tmp_path, name, role, refused
+):
+    columns = recorded_run()
+    columns[name] = columns.pop("friction")
+    change(name, slice(100, 105), -0.2)(columns)
+    path = write_csv(tmp_path / "a.csv", columns)
+    names = Columns(environment=(name, "wind"))
+    roles = {} if role is None else {"env_roles": (role, "side_force")}
+    if refused:
+        line = refusal(path, names, **roles)
+        assert f"line 102: {name} is -0.2, not a measured value" in line
+    else:
+        assert read(path, names, **roles)[0].dataset.env_low[0] == np.float32(-0.2)
 
 
 def test_a_yaw_rate_shows_a_late_yaw_and_driving_backwards_is_right(tmp_path):

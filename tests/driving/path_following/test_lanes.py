@@ -11,8 +11,10 @@ from helpers import jit
 
 import sfkd_jax
 from sfkd_jax import control
+from sfkd_jax import policy as policies
 from sfkd_jax.driving import path_following
 from sfkd_jax.driving.lanes import Obstacles, circles, clearance, lane_along, padded
+from sfkd_jax.driving.path_following.lanes._followers import NEVER, counts_from
 from sfkd_jax.driving.path_following.lanes._judging import Situation
 from sfkd_jax.driving.path_following.lanes._reference import (
     SPLICE,
@@ -20,7 +22,13 @@ from sfkd_jax.driving.path_following.lanes._reference import (
     curve,
     road_ahead,
 )
-from sfkd_jax.driving.paths import Lap, path_from_curvature, path_through, quintic
+from sfkd_jax.driving.paths import (
+    Lap,
+    path_from_curvature,
+    path_through,
+    point_at,
+    quintic,
+)
 from sfkd_jax.info import Claim, ControllerInfo, Reason
 from sfkd_jax.types import Controller
 
@@ -61,7 +69,8 @@ def test_distances_from_boxes_circles_and_things_that_move():
         radius=jnp.asarray([0.5, 0.0]),
         present=jnp.asarray([True, False]),
     )
-    for step, distance in ((0.0, 2.5), (0.5, 2.5), (7.0, np.hypot(3.0, 2.0) - 0.5)):
+    # Beyond its last position it goes on: at step 7 to (4, 14), and its edge to (3, 12).
+    for step, distance in ((0.0, 2.5), (0.5, 2.5), (7.0, np.hypot(3.0, 12.0) - 0.5)):
         found = clearance(turned, jnp.zeros(2), step)
         np.testing.assert_allclose(found, [distance, np.inf], atol=1e-5)
     assert clearance(turned, jnp.asarray([4.0, 0.2]))[0] < -1.0
@@ -81,6 +90,47 @@ def test_padded_obstacles_are_the_same_in_a_fixed_number_of_rows():
         assert np.all(np.isinf(clearance(rows, origin)[count:]))
     with pytest.raises(ValueError, match="3 obstacles do not fit in 2 rows"):
         padded(few, 2)
+
+
+def test_padded_predictions_go_on_as_they_would_without_the_padding():
+    moving = circles(jnp.asarray([[3.0, 4.0], [0.0, -2.0]]), 1.0)
+    ends = jnp.asarray([[[3.0, 4.0], [3.5, 4.0]], [[0.0, -2.0], [0.0, -2.0]]])
+    moving = moving._replace(position=ends)
+    longer = padded(moving, 3, 6)
+    assert longer.position.shape == (3, 6, 2)
+    for step in (0.5, 4.0, 5.0, 9.0):
+        np.testing.assert_allclose(
+            clearance(longer, jnp.zeros(2), step)[:2],
+            clearance(moving, jnp.zeros(2), step),
+            atol=1e-5,
+        )
+    still = padded(circles(jnp.asarray([[3.0, 4.0]]), 1.0), 1, 3)
+    np.testing.assert_array_equal(still.position, [[[3.0, 4.0]] * 3])
+    with pytest.raises(ValueError, match="6 predicted positions do not fit in 5"):
+        padded(longer, 3, 5)
+
+
+def test_with_a_capacity_a_lane_is_compiled_once_for_all_numbers_of_obstacles():
+    traced = []
+
+    def act(params, state, observation, env, scene):
+        traced.append(scene)
+        return jnp.sum(scene[1].present), state, scene[1].position
+
+    fixed = policies._with_capacity(Controller(lambda key: key, act), (4, 3))
+    for count in (0, 1, 4, 2):
+        seen = circles(jnp.arange(2.0 * count).reshape(count, 2), 0.8)
+        for steps in (1, 3):
+            places = np.repeat(np.asarray(seen.position), steps, axis=1)
+            moving = seen._replace(position=places)
+            number, _, position = fixed.act(None, 0.0, 0.0, 0.0, (None, moving))
+            assert number == count
+            assert position.shape == (4, 3, 2)
+    assert len(traced) == 1
+    with pytest.raises(ValueError, match="5 obstacles do not fit in 4 rows"):
+        fixed.act(None, 0.0, 0.0, 0.0, (None, circles(jnp.ones((5, 2)), 0.8)))
+    with pytest.raises(ValueError, match="capacity must be"):
+        policies._with_capacity(fixed, (4, 0))
 
 
 def test_two_boxes_are_never_nearer_than_is_said():
@@ -146,6 +196,71 @@ def test_curvature_beside_a_road_is_that_of_the_positions(road):
     )
     middle = np.arctan2(*along.direction[::-1])
     np.testing.assert_allclose(0.5 * (middle[1:] + middle[:-1]), yaw, atol=1e-4)
+
+
+@pytest.mark.parametrize("spacing", [0.1, 0.125, 0.3, 0.5, 2.0])
+def test_a_lane_looks_ahead_by_distance_whatever_the_spacing_of_its_path(spacing):
+    """Samples lie on a circle; a narrow and slow spot is on both sides of it."""
+    angles = np.linspace(0.0, 4.0, 8001)
+    points = 60.0 * np.stack([np.sin(angles), 1.0 - np.cos(angles)], axis=1)
+    lane = lane_along(path_through(jnp.asarray(points), spacing=spacing), width=8.0)
+    s = spacing * np.arange(len(lane.left))
+    spot = int(np.argmin(np.abs(s - 40.1)))
+    lane = lane._replace(
+        left=lane.left.at[spot].set(1.0), speed=lane.speed.at[spot].set(3.0)
+    )
+    ahead = jit(partial(road_ahead, count=120, accelerations=(9.0, 9.0)))(
+        lane, jnp.asarray(20)
+    )
+    assert 0.5 <= ahead.spacing < 0.7
+    at = float(ahead.spacing) * (20 + np.arange(120))
+    circle = 60.0 * np.stack([np.sin(at / 60.0), 1.0 - np.cos(at / 60.0)])
+    np.testing.assert_allclose(ahead.position, circle, atol=0.01)
+    np.testing.assert_allclose(ahead.curvature, 1.0 / 60.0, atol=1e-3)
+    near = np.abs(at - s[spot]) < ahead.spacing - 1e-3
+    assert near.any()
+    np.testing.assert_allclose(np.asarray(ahead.left)[near].min(), 1.0, atol=1e-5)
+    assert np.all(np.asarray(ahead.left)[near] <= 4.0)
+    assert np.all(np.asarray(ahead.right) == 4.0)
+    # Where it is slow, and nowhere faster than it can brake from to there.
+    np.testing.assert_allclose(ahead.wanted.min(), 9.0, atol=1e-4)
+    beyond = np.abs(at - s[spot]) > max(spacing, ahead.spacing) + 1e-3
+    np.testing.assert_array_equal(np.asarray(ahead.left)[beyond], 4.0)
+
+
+def test_who_follows_in_the_track_counts_when_he_leaves_it():
+    """On a straight road and on a lap, the car at 30 m and 1 m aside."""
+    angle = np.linspace(0.0, 2 * np.pi, 4000, endpoint=False)
+    ring = 40.0 * np.stack([np.sin(angle), 1.0 - np.cos(angle)], axis=1)
+    straight = path_through(jnp.asarray([[0.0, 0.0], [200.0, 0.0]]))
+    lap = path_through(jnp.asarray(ring), closed=True)
+    steps = np.arange(20)
+    rows = {  # distance along, distance aside, step from which on it counts
+        "follows": (10.0 + 1.5 * steps, 1.0 + 0.0 * steps, NEVER),
+        "overtakes": (10.0 + 1.5 * steps, 1.0 + 0.4 * steps, 6),
+        "beside": (29.0 + steps, 1.0 + 0.0 * steps, 0),
+        "ahead": (38.0 + steps, 1.0 + 0.0 * steps, 0),
+        "in the next lane": (10.0 + 1.5 * steps, 4.0 + 0.0 * steps, 0),
+    }
+    for path in (straight, lap):
+        places = []
+        for along, aside, _ in rows.values():
+            points = np.asarray(jax.vmap(partial(point_at, path))(jnp.asarray(along)))
+            normal = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])], axis=1)
+            places.append(points[:, :2] + aside[:, None] * normal)
+        others = circles(jnp.asarray(places)[:, 0], 1.0)
+        others = others._replace(position=jnp.asarray(places))
+        found = counts_from(
+            path,
+            others,
+            jnp.asarray(30.0),
+            jnp.asarray(1.0),
+            KIND,
+            samples=100,
+            spacing=0.5,
+        )
+        # Aside by 0.4 m a step: 1 + 0.9 + 0.26 m of room are left at step 6.
+        np.testing.assert_array_equal(found, [row[2] for row in rows.values()])
 
 
 def follower():
@@ -306,7 +421,8 @@ def test_ways_round_lead_from_one_side_of_an_obstacle_to_the_other_of_the_next()
     task = path_following.Manoeuvres(kind=KIND, dt=DT)
     posts = circles(jnp.asarray([[40.0, 1.2], [85.0, -1.2], [-20.0, 0.0]]), 0.8)
     place, grip = jnp.asarray(2.0), jnp.asarray(0.9 * 9.81)
-    scene = Situation(ahead, straight, posts, place, grip, jnp.asarray(True))
+    all_count = jnp.zeros(3)
+    scene = Situation(ahead, straight, posts, all_count, place, grip, jnp.asarray(True))
     rows = jit(task.ways_round)(scene)
     step = partial(task.step, jnp.asarray(task.weights), scene, jnp.zeros(()))
     judged = jit(jax.vmap(step))(rows)
@@ -331,6 +447,9 @@ def test_what_appears_too_near_to_stop_is_evaded_without_a_claim(lane, road):
     assert 2 < evading.sum() < 30
     claims = np.array([info.lane.clearance for _, _, info in rows])
     assert np.isnan(claims[evading]).all()
+    for _, _, info in np.array(rows, object)[evading]:
+        assert info.claim.reason == Reason.EVADING
+        assert np.isnan(info.claim.bound)
     # The last reference of its own class again, and some time to follow it.
     assert not np.isnan(claims[-10:]).any()
     assert not any(info.healthy for _, _, info in np.array(rows, object)[evading])
@@ -339,6 +458,90 @@ def test_what_appears_too_near_to_stop_is_evaded_without_a_claim(lane, road):
     pull = np.hypot(turned * cars[1:, 3], np.diff(cars[:, 3]) / DT)
     assert pull.max() < 0.95 * 9.81 * 0.3
     assert cars[-1, 3] > 8.0
+
+
+def cars(along, aside, speed, steps=20):
+    """One car on a straight road, predicted at its speed."""
+    places = [[along + DT * speed * step, aside] for step in range(steps)]
+    one = circles(jnp.zeros((1, 2)), 0.0)
+    half = jnp.asarray([KIND.half])
+    return one._replace(position=jnp.asarray([places]), half=half)
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return lane_along(path_through(jnp.asarray([[0.0, 0.0], [500.0, 0.0]])), width=4.0)
+
+
+def test_a_follower_who_would_drive_through_it_does_not_stop_the_car(lane, straight):
+    """He is 20 m behind, 5 m/s faster, and slows at the last moment."""
+
+    def seen(number, car):
+        along = min(-20.0 + DT * 15.0 * number, float(car[0]) - 5.0)
+        return cars(along, 0.0, 15.0)
+
+    for car, _, info in drive(lane, straight, seen, 60):
+        assert car[3] == pytest.approx(10.0, abs=0.05)
+        assert abs(info.lane.offset) < 0.05
+        assert not info.lane.stopping | info.lane.evading
+        assert info.lane.clearance == np.inf
+
+
+@pytest.mark.parametrize("speed", [10.0, 9.0])
+def test_a_car_ahead_that_drives_is_followed_and_not_waited_for(lane, straight, speed):
+    """It is predicted for 2 s. The distance becomes one second of driving."""
+
+    def place(number):
+        return 17.0 + DT * speed * number
+
+    rows = drive(
+        lane, straight, lambda number, car: cars(place(number), 0.0, speed), 200
+    )
+    for number, (car, _, info) in enumerate(rows):
+        assert car[3] > speed - 1.0
+        assert not info.lane.evading
+        assert place(number) - car[0] > 2 * KIND.half[0] + 8.0
+        assert number < 100 or info.lane.admissible
+    assert np.mean([car[3] for car, _, _ in rows[100:]]) > speed - 0.3
+
+
+def test_a_car_ahead_that_brakes_suddenly_is_not_hit(lane, straight):
+    """It was followed at 9 m/s, and brakes with 6 m/s² unannounced."""
+    places = [20.0]
+    speeds = [9.0]
+    for number in range(160):
+        speeds.append(max(speeds[-1] - 6.0 * DT * (number > 100), 0.0))
+        places.append(places[-1] + DT * speeds[-1])
+    rows = drive(
+        lane,
+        straight,
+        lambda number, car: cars(places[number], 0.0, speeds[number]),
+        160,
+    )
+    gaps = [
+        at - car[0] - 2 * KIND.half[0]
+        for at, (car, _, _) in zip(places, rows, strict=False)
+    ]
+    assert gaps[100] > 8.0
+    assert min(gaps) > KIND.margin
+    assert rows[-1][0][3] == 0.0
+
+
+@pytest.mark.parametrize(("width", "narrow"), [(2.25, True), (2.4, False)])
+def test_a_lane_too_narrow_for_the_corridor_stops_and_says_so(
+    lane, straight, width, narrow
+):
+    """2.32 m are needed: the width, the corridor to each side, what corners swing."""
+    tight = straight._replace(left=0.0 * straight.left + width / 2)
+    tight = tight._replace(right=tight.left)
+    nothing = circles(jnp.zeros((0, 2)), 0.8)
+    rows = drive(lane, tight, lambda *_: nothing, 40)
+    room = 0.5 * width - KIND.half[1] - KIND.margin
+    for _, _, info in rows:
+        assert bool(info.lane.stopping) == narrow
+        assert bool(info.lane.admissible) != narrow
+        assert info.lane.edge == pytest.approx(room, abs=0.01)
+    assert (rows[-1][0][3] == 0.0) == narrow
 
 
 @pytest.mark.parametrize("attack", ["inside", "nan", "edge"])

@@ -173,6 +173,58 @@ def test_a_path_through_positions_on_a_circle_is_that_circle():
     )
 
 
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.05])
+def test_a_path_recorded_with_noise_is_smoothed_or_refused(noise):
+    """A straight road, a position every half metre: curvatures of a class are 0.05."""
+    s = np.arange(0.0, 200.1, 0.5)
+    recorded = np.column_stack([s, 0.0 * s])
+    recorded += noise * np.random.default_rng(0).standard_normal(recorded.shape)
+    recorded = jnp.asarray(recorded, jnp.float32)
+    with pytest.raises(ValueError, match=r"a curvature of 0\.\d+ 1/m at \d.*tolerance"):
+        paths.path_through(recorded, curvature=0.05)
+    tolerance = noise * np.sqrt(2.0)
+    path = paths.path_through(recorded, tolerance=tolerance, curvature=0.002)
+    assert np.abs(path.points[:, 1]).max() < noise
+    np.testing.assert_allclose(path.length, 200.0, atol=1.0)
+
+
+@pytest.mark.parametrize("apart", [2, 5, 10])
+def test_a_path_bends_smoothly_beside_way_points_far_apart(apart):
+    """Its curvature is a sine of 0.026 1/m; straight between them it would be 0.25."""
+    s = np.arange(0.0, 300.05, 0.1)
+    bend = 0.026 * np.sin(s / 25.0)
+    road = jax.jit(partial(path_from_curvature, spacing=0.1))(np.float32(bend))
+    sparse = road.points[:: 10 * apart, :2]
+    path = paths.path_through(sparse, tolerance=0.01, curvature=0.027)
+    samples = np.asarray(path.points)
+    away = samples[:, None, :2] - np.asarray(road.points)[None, :, :2]
+    away = np.linalg.norm(away, axis=2)
+    assert away.min(axis=1).max() < 0.15
+    # Beyond the first and the last way-point nothing says how it goes on.
+    inside = (samples[:, 0] > 20.0) & (np.arange(len(samples)) < len(samples) - 40)
+    off = np.abs(samples[:, 3] - bend[away.argmin(axis=1)])
+    assert off[inside].max() < 2e-3
+
+
+def test_a_smooth_lap_closes_and_few_positions_are_a_straight_path():
+    angle = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)
+    ring = 50.0 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+    ring += 0.03 * np.random.default_rng(0).standard_normal(ring.shape)
+    lap = paths.path_through(jnp.asarray(ring), closed=True, tolerance=0.04)
+    assert isinstance(lap, paths.Lap)
+    samples = np.asarray(lap.points)
+    np.testing.assert_allclose(samples[0, :2], samples[-1, :2], atol=1e-4)
+    np.testing.assert_allclose(samples[-1, 2] - samples[0, 2], 2 * np.pi, atol=1e-4)
+    np.testing.assert_allclose(samples[0, 3], samples[-1, 3], atol=1e-5)
+    np.testing.assert_allclose(samples[:, 3], 0.02, atol=2e-3)
+    steps = np.linalg.norm(np.diff(samples[:, :2], axis=0), axis=1)
+    np.testing.assert_allclose(steps, lap.spacing, rtol=1e-3)
+    ends = jnp.asarray([[9e2, 5e2], [1e3, 5e2]])
+    two = np.asarray(paths.path_through(ends, tolerance=0.1).points)
+    np.testing.assert_allclose(two[:, 0], np.linspace(9e2, 1e3, 201), rtol=1e-6)
+    np.testing.assert_allclose(two[:, 1:], [[5e2, 0.0, 0.0]] * 201, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("points", "words"),
     [
@@ -184,3 +236,9 @@ def test_a_path_through_positions_on_a_circle_is_that_circle():
 def test_positions_that_make_no_path_are_refused(points, words):
     with pytest.raises(ValueError, match=words):
         paths.path_through(jnp.asarray(points))
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, np.nan, np.inf])
+def test_a_tolerance_that_is_no_distance_is_refused(tolerance):
+    with pytest.raises(ValueError, match="tolerance must be 0 or more"):
+        paths.path_through(jnp.asarray([[0.0, 0.0], [9.0, 0.0]]), tolerance=tolerance)

@@ -32,6 +32,12 @@ SLOWER = 1.2
 """Ratio of the period of a log to that of the model, from which on the log is refused:
 rows between its own would be invented.
 """
+BURSTS = 0.5
+"""Ratio of the median wait between rows to the mean of the shortest 95 %, below which
+rows come in bursts.
+"""
+UNEVEN = 0.3
+"""Share of the period by which a wait may differ from it."""
 LARGEST = 1e38
 """Largest number that is accepted. Segments are stored in float32, which can hold
 differences of such numbers.
@@ -61,6 +67,7 @@ class Checks:
     drop_missing: bool
     limits: Bounds
     box: Bounds
+    roles: tuple[str, ...] = ()
 
     def apply(self, logs: list[Log]) -> tuple[list[Log], list[Finding]]:
         """Return the runs that can be used, after cutting, and all findings."""
@@ -93,6 +100,10 @@ class Checks:
         findings += self._duration(log)
         if not _has_steps(log):
             return log, findings
+        # Without the times of the measurements no motion can be compared.
+        bursts = list(self._bursts(log))
+        if bursts:
+            return log, findings + bursts
         unit_findings = list(check_units(log, self.columns))
         findings += unit_findings
         # With wrong units every step would look like a jump.
@@ -183,6 +194,19 @@ class Checks:
                 f"{self.steps * self.dt:.4g} s; not used"
             )
 
+    def _bursts(self, log: Log) -> Iterator[Finding]:
+        """Find rows that were stamped when several of them arrived together."""
+        waits = np.sort(log.waits[log.joined])
+        # A few pauses are no bursts.
+        usual = float(np.mean(waits[: max(round(0.95 * len(waits)), 1)]))
+        if log.period < BURSTS * usual:
+            others = float(np.median(waits[waits > usual]))
+            yield Finding(
+                f"{log.whole}: rows come in bursts, most of them {log.period:.2g} s "
+                f"after the row before and the others {others:.2g} s; log when a row "
+                "was measured and not when it arrived, or keep one row of each burst"
+            )
+
     def _sampling(self, log: Log) -> Iterator[Finding]:
         """Find slow sampling, which is refused, gaps and uneven sampling."""
         waits = log.waits
@@ -200,7 +224,7 @@ class Checks:
             refused=False,
         )
         # A few uneven steps are usual. Gaps have been reported above.
-        uneven = (np.abs(waits - period) > 0.5 * period) & ~gaps & log.joined
+        uneven = (np.abs(waits - period) > UNEVEN * period) & ~gaps & log.joined
         if uneven.mean() > 0.1:
             yield from first_of(
                 log,

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from sfkd_jax.driving.logs._checks import Checks
 from sfkd_jax.driving.logs._findings import Finding, first_of, warning
 from sfkd_jax.driving.logs._logs import Log
+from sfkd_jax.driving.plants import FRICTION, MASS
 
 Steps: TypeAlias = Float[np.ndarray, " step"]
 Values: TypeAlias = Float[np.ndarray, " _"]
@@ -29,6 +30,10 @@ change the gain by less.
 """
 OTHER_UNIT = 20.0
 """Ratio of the values of two runs from which on they are in different units."""
+PLACEHOLDERS = (99.0, 999.0, 9999.0, 99999.0, 32767.0, 32768.0, 65535.0)
+"""Sizes of numbers that loggers write where there is no value."""
+NEVER_NEGATIVE = (FRICTION, MASS)
+"""Roles of entries of e that cannot be below 0."""
 BEYOND = 30.0
 """Ratio of a value to all others from which on it stands for a missing one."""
 
@@ -44,16 +49,18 @@ def compare(checks: Checks, logs: list[Log]) -> Iterator[Finding]:
     steering, acceleration = checks.columns.control
     yield from _odd_gains(logs, turns, steering, yaw)
     yield from _odd_gains(logs, _accelerations, acceleration, speed)
+    for k, name in enumerate(checks.columns.control):
+        yield from _placeholders(logs, [log.controls[:, k] for log in logs], name)
     size = logs[0].envs.shape[1]
     names = checks.columns.environment
     if len(names) != size:
         return
-    for k, name in enumerate(names):
+    for k, (name, role) in enumerate(zip(names, checks.roles, strict=True)):
         channel = [log.envs[:, k] for log in logs]
         yield from _odd_units(logs, channel, name)
         # Whoever states E says which values are real; others are refused elsewhere.
         if checks.box == (None, None):
-            yield from _placeholders(logs, channel, name)
+            yield from _placeholders(logs, channel, name, role)
 
 
 def turns(log: Log) -> tuple[Steps, Steps]:
@@ -141,7 +148,7 @@ def _odd_units(
 
 
 def _placeholders(
-    logs: list[Log], channel: Sequence[Values], name: str
+    logs: list[Log], channel: Sequence[Values], name: str, role: str | None = None
 ) -> Iterator[Finding]:
     """Find a number that stands for a missing one, such as 9999, or a friction of -1.
 
@@ -149,21 +156,26 @@ def _placeholders(
         logs: the runs.
         channel: its values in each run.
         name: of the channel.
+        role: of the entry of e, see `plants.roles_of`; None for a command. A command
+            may be much larger once, so that only usual placeholders are found.
     """
     sizes = np.abs(np.concatenate(channel))
     largest = float(sizes.max())
     others = float(sizes[sizes < largest].max(initial=0.0))
     beyond = 0.0 < BEYOND * others < largest
+    beyond &= role is not None or largest in PLACEHOLDERS
+    hint = "; leave the cell empty where nothing was measured"
+    if role is not None:
+        hint += ", or pass environment.low and environment.high"
     for log, values in zip(logs, channel, strict=True):
         odd = np.abs(values) == largest if beyond else np.zeros(len(values), dtype=bool)
         # A run that has one value throughout has been measured so.
         odd &= not odd.all()
-        if name.startswith("friction"):
+        if role in NEVER_NEGATIVE:
             odd |= values < 0.0
         yield from first_of(
             log,
             odd,
             lambda k, values=values: f"{name} is {values[k]:.4g}, not a measured value",
-            hint="; leave the cell empty where nothing was measured, or pass "
-            "environment.low and environment.high",
+            hint=hint,
         )

@@ -14,10 +14,11 @@ from sfkd_jax.driving.logs._checks import Bounds, Checks
 from sfkd_jax.driving.logs._command_lags import CommandLag, command_lags
 from sfkd_jax.driving.logs._findings import Finding
 from sfkd_jax.driving.logs._joint_checks import check_together
-from sfkd_jax.driving.logs._log_files import log_files
+from sfkd_jax.driving.logs._log_files import SUFFIXES, left_out, log_files
 from sfkd_jax.driving.logs._logs import Columns, Log
 from sfkd_jax.driving.logs._reading import read_logs
 from sfkd_jax.driving.logs._segments import Piece, assign_parts, pieces, segments
+from sfkd_jax.driving.plants import roles_of
 from sfkd_jax.ranges import Fraction, NonNegativeInt, Positive, Real, check_choice
 from sfkd_jax.types import BODY, Trajectory
 
@@ -25,6 +26,8 @@ MOST_LINES = 20
 """Number of warnings that are reported in full; further ones are only counted. The same
 holds for reasons to refuse the logs.
 """
+FEW = 5
+"""Number of files that a line names."""
 Coverage: TypeAlias = dict[str, dict[str, dict[str, float]]]
 """`coverage` of every channel by its name, in the groups "state", "control" and
 "environment".
@@ -63,6 +66,7 @@ def from_logs(
     seed: NonNegativeInt = 0,
     env_low: tuple[Real, ...] | None = None,
     env_high: tuple[Real, ...] | None = None,
+    env_roles: tuple[str, ...] = (),
 ) -> LoggedDataset:
     """Make a data set of recorded runs, or refuse them with the reason.
 
@@ -86,6 +90,8 @@ def from_logs(
         seed: of the random order of runs.
         env_low: lower corner of E, or None for a box as large as the logs need.
         env_high: upper corner of E, or None.
+        env_roles: what each entry of e is, see `plants.roles_of`; () for what the
+            names of the columns say.
 
     Raises:
         ValueError: the first reason why the logs are refused; the others are reported.
@@ -103,6 +109,7 @@ def from_logs(
         drop_missing=missing == "drop",
         limits=limits,
         box=box,
+        roles=roles_of(columns.environment, env_roles),
     )
     logs = _checked_logs(path, checks, needs_environment, report)
     lags = command_lags(checks, logs)
@@ -143,6 +150,12 @@ def _checked_logs(
         needs_environment=needs_environment,
         blanks=checks.drop_missing,
     )
+    if others := left_out(path):
+        names = ", ".join(others[:FEW]) + (", …" if len(others) > FEW else "")
+        report(
+            f"warning: {path}: {len(others)} files are left out, since they are no "
+            f"{', '.join(SUFFIXES)}: {names}"
+        )
     if conversions:
         report(f"converted to SI units: {', '.join(conversions)}")
     logs, findings = checks.apply(recorded)

@@ -56,6 +56,23 @@ def _logs_in(folder: Path) -> list[Path]:
     ]
 
 
+def left_out(path: str) -> list[str]:
+    """Return the names of the files in a folder that are read by nobody.
+
+    Hidden files are none of them.
+    """
+    place = Path(path).expanduser()
+    if not place.is_dir():
+        return []
+    return sorted(
+        file.name
+        for file in place.iterdir()
+        if file.is_file()
+        and file.suffix.lower() not in SUFFIXES
+        and not file.name.startswith(".")
+    )
+
+
 def _matching(place: Path) -> list[Path]:
     """Return a file, or the files that match a glob."""
     # A file whose name holds brackets is meant itself, and not what it would match.

@@ -16,6 +16,8 @@ from sfkd_jax.driving.logs._motion import CHORD, Chords, agreement, find_chords
 
 PLAUSIBLE_RATIO = (0.8, 1.25)
 """Range of path length over integrated speed of a plausible log."""
+LEAST_TURN = 0.1
+"""Standard deviation of the yaw from which on its size is checked [rad]."""
 DEGREES = 9e-6
 """Degrees of latitude in a metre."""
 CAUSES_OF_RATIO = (
@@ -91,6 +93,8 @@ def _check_heading(log: Log, columns: Columns, chords: Chords) -> Iterator[Findi
     reversals = list(_reversals(log, columns, chords))
     if abs(agreed) > 0.7 and abs(np.angle(agreed)) < 0.5:
         yield from reversals
+        if not reversals:
+            yield from _check_size(log, columns, chords)
         return
     compass = f"{name} is probably a compass heading"
     # What the column may hold instead, and the yaw that would follow from it.
@@ -126,6 +130,25 @@ def _check_heading(log: Log, columns: Columns, chords: Chords) -> Iterator[Findi
             f"{difference} at random; a robot that drives sideways, "
             "or columns that changed places?"
         )
+
+
+def _check_size(log: Log, columns: Columns, chords: Chords) -> Iterator[Finding]:
+    """Compare how much the direction of travel turns with how much yaw does."""
+    yaw = chords.yaw - chords.yaw.mean()
+    if np.std(yaw) < LEAST_TURN:
+        return
+    off = chords.course - chords.yaw
+    off = np.angle(np.exp(1j * (off - np.angle(agreement(off)))))
+    gain = 1.0 + float(np.mean(off * yaw) / np.mean(yaw**2))
+    rest = np.std(off - (gain - 1.0) * yaw)
+    # Tyres that slip put the course beside the yaw, but not in proportion to it.
+    if rest > 0.3 * np.std(yaw) or PLAUSIBLE_RATIO[0] < gain < PLAUSIBLE_RATIO[1]:
+        return
+    name = columns.state[2]
+    yield Finding(
+        f"{log.whole}: the direction of travel turns {gain:.3g} times as much as "
+        f"{name}; has {name} another unit or scale?"
+    )
 
 
 def _reversals(log: Log, columns: Columns, chords: Chords) -> Iterator[Finding]:

@@ -16,13 +16,16 @@ from sfkd_jax.driving.plants._own import hidden_change as hidden_change
 from sfkd_jax.driving.plants._own import on_host as on_host
 from sfkd_jax.driving.plants._own import own as own
 from sfkd_jax.driving.plants._own import simulator as simulator
+from sfkd_jax.driving.plants._variables import FRICTION as FRICTION
 from sfkd_jax.driving.plants._variables import KNOWN_STATES as KNOWN_STATES
+from sfkd_jax.driving.plants._variables import MASS as MASS
 from sfkd_jax.driving.plants._variables import ControlVariable as ControlVariable
 from sfkd_jax.driving.plants._variables import (
     EnvironmentVariable as EnvironmentVariable,
 )
 from sfkd_jax.driving.plants._variables import Size as Size
 from sfkd_jax.driving.plants._variables import StateVariable as StateVariable
+from sfkd_jax.driving.plants._variables import roles_of as roles_of
 from sfkd_jax.driving.plants._vehicle import Vehicle as Vehicle
 from sfkd_jax.driving.plants._vehicle import equivalent_wind as equivalent_wind
 from sfkd_jax.driving.plants._vehicle import rk4 as rk4

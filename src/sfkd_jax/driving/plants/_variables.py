@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 
@@ -112,6 +112,52 @@ FRICTION_AND_WIND = (
 """e, unless `environment.names` or the columns of logs say otherwise."""
 CAR_SIZE = Size(4.5, 2.0)
 """Size of every vehicle that does not state one."""
+
+
+FRICTION = "friction"
+"""Role of the entry of e that is the friction: lanes read the grip from it [-]."""
+MASS = "mass"
+"""Role of an entry that is a mass [kg]."""
+SIDE_FORCE = "side_force"
+"""Role of an entry that pushes to a side, such as a wind."""
+OTHER = "other"
+"""Role of an entry of which nothing is known but its box."""
+ROLES = (FRICTION, MASS, SIDE_FORCE, OTHER)
+_ROLE_OF_NAMES = (
+    ("friction", FRICTION),
+    ("mass", MASS),
+    ("side force", SIDE_FORCE),
+    ("wind", SIDE_FORCE),
+    ("lateral wind", SIDE_FORCE),
+)
+"""What a name begins with, and the role of such an entry if none is stated."""
+
+
+def roles_of(names: Sequence[str], stated: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the role of each entry of e, one of `ROLES`.
+
+    Args:
+        names: of the entries, with or without their units.
+        stated: roles that the user states, one for each entry; () for those of the
+            names.
+
+    Raises:
+        ValueError: not every entry has one of the roles, or two are the friction.
+    """
+
+    def by_name(name: str) -> str:
+        roles = (role for known, role in _ROLE_OF_NAMES if name.startswith(known))
+        return next(roles, OTHER)
+
+    if not stated:
+        return tuple(map(by_name, names))
+    unknown = set(stated) - set(ROLES)
+    if unknown or len(stated) != len(names) or stated.count(FRICTION) > 1:
+        raise ValueError(
+            f"environment.roles needs one of {', '.join(ROLES)} for each of "
+            f"{', '.join(names)}, and friction once at most; got {', '.join(stated)}"
+        )
+    return tuple(stated)
 
 
 def states_of(names: Iterable[str]) -> tuple[StateVariable, ...]:

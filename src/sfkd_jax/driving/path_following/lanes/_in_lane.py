@@ -12,16 +12,20 @@ from jaxtyping import Array, Bool, Int
 
 from sfkd_jax.control import Stateful, all_finite, factory
 from sfkd_jax.driving.lanes import Lane, Obstacles, finite
+from sfkd_jax.driving.path_following.lanes._followers import counts_from
 from sfkd_jax.driving.path_following.lanes._judging import Judged, Situation
 from sfkd_jax.driving.path_following.lanes._manoeuvre import Manoeuvres
 from sfkd_jax.driving.path_following.lanes._reference import (
     BEHIND,
+    SPLICE,
     Committed,
+    RoadAhead,
     road_ahead,
+    sampling,
     speed_profile,
     window,
 )
-from sfkd_jax.driving.paths import Lap, point_at, project
+from sfkd_jax.driving.paths import SPACING, Lap, Path, point_at, project
 from sfkd_jax.info import ControllerInfo, LaneInfo, Reason
 from sfkd_jax.ranges import (
     AtLeastOne,
@@ -37,6 +41,7 @@ from sfkd_jax.types import (
     Environment,
     Key,
     Params,
+    Reference,
     Scalar,
     State,
 )
@@ -70,6 +75,27 @@ class LaneState(NamedTuple):
     doubt: Int[Array, ""]
 
 
+def moved_on(
+    state: LaneState, path: Path, points: Int[Array, ""], spacing: float = SPACING
+) -> LaneState:
+    """Return the state along a window of a road that has moved on.
+
+    Args:
+        state: along the window before.
+        path: of the window.
+        points: of the path, by which it has moved on. Where several lie between two
+            samples of the road, it is a multiple of their number.
+        spacing: that of `InLane`.
+    """
+    moved = path.spacing * points
+    distance, _ = sampling(path, spacing)
+    index = state.committed.index - jnp.round(moved / distance).astype(int)
+    return state._replace(
+        progress=state.progress - moved,
+        committed=state.committed._replace(index=index),
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class InLane(Stateful):
     """A controller that drives in a lane, round obstacles, or stops before them.
@@ -79,7 +105,11 @@ class InLane(Stateful):
     as it is free. Otherwise the car brakes on it, to stand in front of what is in the
     way. If it would not stand in time, it evades with all of the grip, outside the
     class and without a claim: the bound and `clearance` are then NaN. If a number of
-    the scene is not finite, the car stops.
+    the scene is not finite, or the lane is too narrow for the car and its corridor, the
+    car stops.
+
+    Who follows in the track of the car is no obstacle. Others go on with their last
+    predicted velocity.
 
     `act` takes a scene (lane and obstacles) in place of the reference. `info` gains
     `lane`, see `LaneInfo`.
@@ -89,8 +119,8 @@ class InLane(Stateful):
         planner: of `Manoeuvres.task`, with horizon 1.
         manoeuvres: the references to choose from.
         horizon: number of points of the reference that `inner` reads.
-        samples: number of samples of the road that are planned, at the spacing of the
-            path.
+        view: length of the road that is planned [m].
+        spacing: of its samples [m].
         period: number of steps from one search to the next.
         friction: entry of e that is the friction; None if none is.
         lowest: friction that is assumed where e is not known.
@@ -104,7 +134,8 @@ class InLane(Stateful):
     planner: Controller
     manoeuvres: Manoeuvres
     horizon: AtLeastOne
-    samples: AtLeastOne = 200
+    view: Positive = 100.0
+    spacing: Positive = SPACING
     period: AtLeastOne = 3
     friction: NonNegativeInt | None = 0
     lowest: Positive = 0.3
@@ -114,6 +145,11 @@ class InLane(Stateful):
 
     def __post_init__(self) -> None:
         check_intervals(self)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of the road that are planned."""
+        return max(round(self.view / self.spacing), 2 * SPLICE)
 
     def init(self, key: Key) -> LaneState:
         """Return the state before the first control step."""
@@ -146,7 +182,6 @@ class InLane(Stateful):
         weights = state.planner.tuning.cost
         scene, clean = finite(*scene)
         progress, situation = self._situation(state, observation, env, scene, clean)
-        path = scene[0].path
         kept = task.judge(weights, situation, situation.committed)
         free = ~jnp.any(kept.blocked)
         # The committed reference is judged at every step, so an obstacle that appears
@@ -166,9 +201,7 @@ class InLane(Stateful):
         resorted = (~free | (state.doubt == self.trial)) & ~taken
         evading = resorted & (judged.outside > 0.0)
         doubt = jnp.where(evading, self.trial, jnp.maximum(state.doubt - 1, 0))
-        times = task.dt * jnp.arange(1, self.horizon + 1)
-        at = partial(window, path, committed, judged.curve, situation.place)
-        ahead = at(times).at[:, 3].set(at(times + self.lead)[:, 3])
+        ahead = self._window(scene[0].path, situation, committed, judged)
         control, inner, info = self.inner.act(
             params, state.inner, observation, env, ahead
         )
@@ -184,6 +217,7 @@ class InLane(Stateful):
                 reference=ahead,
                 offset=committed.move[0, BEHIND],
                 clearance=jnp.where(clean, room, jnp.nan),
+                edge=jnp.where(clean, jnp.min(judged.edge), jnp.nan),
                 admissible=judged.violation <= 0.0,
                 stopping=~judged.curve.reached[-1],
                 evading=evading,
@@ -193,6 +227,43 @@ class InLane(Stateful):
         started = state.started | all_finite(observation)
         after = LaneState(inner, planner, committed, progress, wait, started, doubt)
         return control, after, info
+
+    def _window(
+        self, path: Path, situation: Situation, committed: Committed, judged: Judged
+    ) -> Reference:
+        """Return the window of the committed reference that `inner` follows."""
+        times = self.manoeuvres.dt * jnp.arange(1, self.horizon + 1)
+        spacing = situation.road.spacing
+        place = situation.place
+        at = partial(window, path, spacing, committed, judged.curve, place)
+        return at(times).at[:, 3].set(at(times + self.lead)[:, 3])
+
+    def _grip(self, env: Environment) -> Scalar:
+        """Return the acceleration that the tyres allow [m/s²]."""
+        friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
+        return GRAVITY * jnp.where(jnp.isfinite(friction), friction, self.lowest)
+
+    def _new(
+        self, road: RoadAhead, first: Int[Array, ""], lateral: Scalar, speed: Scalar
+    ) -> Committed:
+        """Return a reference that begins where the car is, at its speed.
+
+        Args:
+            road: ahead of the car.
+            first: index of its first sample.
+            lateral: how far left of the path the car is [m].
+            speed: of the car [m/s].
+        """
+        limits = self.manoeuvres.kind
+        square = speed_profile(
+            road.wanted,
+            jnp.maximum(speed, 0.0) ** 2,
+            road.spacing,
+            limits.acceleration,
+            limits.deceleration,
+        )
+        move = jnp.zeros((3, self.samples)).at[0].set(lateral)
+        return Committed(first, move, square)
 
     def _situation(
         self,
@@ -212,6 +283,7 @@ class InLane(Stateful):
         position = observation[:2]
         index = state.committed.index
         square = state.committed.square
+        distance, gaps = sampling(path, self.spacing)
         known = all_finite(observation)
         guess = state.progress + self.manoeuvres.dt * jnp.sqrt(square[BEHIND])
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
@@ -225,32 +297,30 @@ class InLane(Stateful):
         if isinstance(path, Lap):
             # Where a lap starts again, so do the projection and the samples.
             behind = progress < start - 0.5 * path.length
-            index = index - jnp.where(behind, path.points.shape[0] - 1, 0)
-        first = jnp.floor(progress / path.spacing).astype(int) - BEHIND
+            index = index - jnp.where(behind, gaps, 0)
+        first = jnp.floor(progress / distance).astype(int) - BEHIND
         first = jnp.where(fresh, first, jnp.maximum(first, index))
-        road = road_ahead(
-            lane, first, self.samples, (limits.acceleration, limits.deceleration)
-        )
-        # A new reference begins where the car is, at its speed.
-        move = jnp.zeros((3, self.samples)).at[0].set(lateral)
-        speed = jnp.maximum(observation[3], 0.0)
-        new_square = speed_profile(
-            road.wanted,
-            speed**2,
-            path.spacing,
-            limits.acceleration,
-            limits.deceleration,
-        )
+        accelerations = (limits.acceleration, limits.deceleration)
+        road = road_ahead(lane, first, self.samples, accelerations, self.spacing)
+        new = self._new(road, first, lateral, observation[3])
         held = state.committed._replace(index=index).at(first, road.wanted)
-        new = Committed(first, move, new_square)
-        friction = jnp.asarray(jnp.nan) if self.friction is None else env[self.friction]
-        friction = jnp.where(jnp.isfinite(friction), friction, self.lowest)
+        committed = jax.tree.map(partial(jnp.where, fresh), new, held)
+        follows = counts_from(
+            path,
+            obstacles,
+            progress,
+            committed.move[0, BEHIND],
+            limits,
+            samples=self.samples,
+            spacing=self.spacing,
+        )
         return progress, Situation(
             road=road,
-            committed=jax.tree.map(partial(jnp.where, fresh), new, held),
+            committed=committed,
             obstacles=obstacles,
-            place=progress / path.spacing - first,
-            grip=GRAVITY * friction,
+            counts_from=follows,
+            place=progress / distance - first,
+            grip=self._grip(env),
             clean=clean,
         )
 

@@ -26,6 +26,14 @@ ALMOST = 0.95
 """Share of the grip that a stop uses which cannot be gentler."""
 TRACKED = 3.0
 """Largest v² κ that a law can still follow [m/s²]."""
+SLOW = 0.5
+"""Speed from which on a car ahead drives [m/s]."""
+HEADWAY = 1.0
+"""Time after which the car has reacted to one ahead that brakes [s]."""
+SOON = 4.0
+"""Time after which the distance from a car ahead must be safe [s]: somebody who cuts in
+leaves less, and is left to gain it.
+"""
 LATE = 0.03
 """Distance by which an obstacle may be nearer between two samples than at both [m]."""
 
@@ -80,6 +88,8 @@ class Situation(NamedTuple):
         road: ahead of the car.
         committed: the reference that the car follows, from the same sample on.
         obstacles: all of them finite.
+        counts_from: step from which on each obstacle counts, see
+            `_followers.counts_from`.
         place: of the car, in samples from the first one.
         grip: acceleration that the tyres allow [m/s²].
         clean: whether all numbers of the scene are finite; if not, nothing is free.
@@ -88,6 +98,7 @@ class Situation(NamedTuple):
     road: RoadAhead
     committed: Committed
     obstacles: Obstacles
+    counts_from: Float[Array, " obstacle"]
     place: Scalar
     grip: Scalar
     clean: Bool[Array, ""]
@@ -103,6 +114,8 @@ class Judged(NamedTuple):
         edge: what the edges of the lane leave beyond what is needed [m].
         curve: the reference in the world.
         strain: used share of what tyres and law can do at most.
+        headway: what cars ahead leave beyond a safe distance, after a time to reach it
+            [m].
     """
 
     cost: Scalar
@@ -111,6 +124,7 @@ class Judged(NamedTuple):
     edge: Float[Array, " sample"]
     curve: Curve
     strain: Scalar
+    headway: Scalar
 
     @property
     def blocked(self) -> Bool[Array, " sample"]:
@@ -121,6 +135,7 @@ class Judged(NamedTuple):
     def violation(self) -> Scalar:
         """How far the reference is from being admissible; 0 if it is."""
         room = jnp.min(jnp.minimum(self.gap, self.edge))
+        room = jnp.minimum(room, self.headway)
         return jnp.maximum(jnp.maximum(self.outside, -room), 0.0)
 
 
@@ -166,7 +181,7 @@ class Judge:
         # What lies before the splice cannot be changed any more.
         outside = jnp.max(jnp.where(along.reached, shares, 0.0)[:, SPLICE:]) - 1.0
         strain = jnp.max(jnp.where(along.reached, used, 0.0)[SPLICE:])
-        gap = self._gap(situation, along)
+        gap, headway = self._gaps(situation, along, square)
         edge = self._edge(road, plan.move, along)
         costs = jnp.stack(
             [
@@ -178,32 +193,86 @@ class Judge:
             ]
         )
         cost = road.spacing * jnp.sum(weights @ costs[:, BEHIND:])
-        return Judged(cost, outside, gap, edge, along, strain)
+        return Judged(cost, outside, gap, edge, along, strain, headway)
 
-    def _gap(self, situation: Situation, along: Curve) -> Float[Array, " sample"]:
-        """Return what obstacles leave beyond what is needed [m]."""
+    def _gaps(
+        self, situation: Situation, along: Curve, square: Float[Array, " sample"]
+    ) -> tuple[Float[Array, " sample"], Scalar]:
+        """Return what obstacles leave beyond what is needed, and the headway [m]."""
         samples = jnp.arange(along.times.shape[0])
         now = jnp.interp(situation.place, samples, along.times)
         steps = jnp.maximum(along.times - now, 0.0) / self.dt
 
         # Obstacles come one after the other: all samples of all plans are then one long
         # loop, in which nothing is looked up.
-        def nearer(nearest: Array, inputs: Any) -> tuple[Array, None]:
-            obstacle, place = inputs
+        def nearer(nearest: Any, inputs: Any) -> tuple[Any, None]:
+            obstacle, place, counts_from = inputs
+            headway = jnp.inf
+            if obstacle.position.shape[0] > 1:
+                headway = self._headway(situation, along, square, obstacle, place)
+                later = jnp.maximum(counts_from, SOON / self.dt)
+                headway = jnp.where(steps >= later, headway, jnp.inf)
             gap = distance(
                 obstacle, place, along.position, along.direction, self.limits.half
             )
-            return jnp.minimum(nearest, gap), None
+            gap = jnp.where(steps >= counts_from, gap, jnp.inf)
+            return jax.tree.map(jnp.minimum, nearest, (gap, headway)), None
 
         def places_of(obstacle: Obstacles) -> Any:
             return place_at(obstacle, steps)
 
         places = jax.vmap(places_of)(situation.obstacles)
         free = jnp.full(samples.shape, jnp.inf)
-        gap, _ = jax.lax.scan(nearer, free, (situation.obstacles, places))
+        obstacles = (situation.obstacles, places, situation.counts_from)
+        (gap, headway), _ = jax.lax.scan(nearer, (free, free), obstacles)
         gap = gap - LATE - self.limits.margin
         gap = jnp.where(_counts(along), gap, jnp.inf)
-        return jnp.where(situation.clean, gap, -jnp.inf)
+        headway = jnp.min(jnp.where(_counts(along), headway, jnp.inf))
+        return jnp.where(situation.clean, gap, -jnp.inf), headway
+
+    def _headway(
+        self,
+        situation: Situation,
+        along: Curve,
+        square: Float[Array, " sample"],
+        obstacle: Obstacles,
+        place: tuple[Float[Array, " sample"], Float[Array, " sample"]],
+    ) -> Float[Array, " sample"]:
+        """Return what a car ahead leaves beyond a safe distance [m].
+
+            d = v T + (v² − u²) / (2 b)
+
+        is what the car needs if that one brakes as hard from u as it does itself from v
+        (Shalev-Shwartz et al., arXiv:1708.06374). It is infinite for what does not
+        drive ahead in the track of the car.
+
+        Args:
+            situation: of the car.
+            along: the reference.
+            square: v² along it [m²/s²].
+            obstacle: a row of `Obstacles`, with more than one position.
+            place: where it is when the car is at each sample [m].
+        """
+        cos, sin = along.direction
+        x = place[0] - along.position[0]
+        y = place[1] - along.position[1]
+        length, width = obstacle.half
+        turned_cos = jnp.abs(jnp.cos(obstacle.yaw) * cos + jnp.sin(obstacle.yaw) * sin)
+        turned_sin = jnp.abs(jnp.sin(obstacle.yaw) * cos - jnp.cos(obstacle.yaw) * sin)
+        long = turned_cos * length + turned_sin * width + obstacle.radius
+        wide = turned_cos * width + turned_sin * length + obstacle.radius
+        ahead = cos * x + sin * y
+        aside = jnp.abs(cos * y - sin * x)
+        velocity = (obstacle.position[-1] - obstacle.position[-2]) / self.dt
+        speed = cos * velocity[0] + sin * velocity[1]
+        # Who crosses the road is passed, and who stands is stopped for.
+        drives = speed > jnp.maximum(0.7 * jnp.linalg.norm(velocity), SLOW)
+        in_track = aside < wide + self.limits.half[1] + self.limits.margin
+        hardest = jnp.minimum(ALMOST * situation.grip, self.limits.braking)
+        closing = jnp.maximum(square - speed**2, 0.0) / (2.0 * hardest)
+        needed = HEADWAY * jnp.sqrt(square) + closing
+        follows = obstacle.present & drives & in_track & (ahead > 0.0)
+        return jnp.where(follows, ahead - long - self.limits.half[0] - needed, jnp.inf)
 
     def _edge(
         self, road: RoadAhead, move: Float[Array, "3 sample"], along: Curve

@@ -43,6 +43,8 @@ ENDS = range(-5, 6)
 """Lateral positions at which evasions end, in fifths of the free lane."""
 LENGTHS = (0.7, 0.85, 1.0, 1.25)
 """Lengths of evasions, relative to the length that takes all of the grip."""
+GAINED = 0.02
+"""Room that the last resort must leave beyond that of a stop [m]."""
 BRAKING = (0.0, 0.4, 0.8)
 """Shares of the grip left over by the lateral move that evasions brake with."""
 
@@ -261,9 +263,10 @@ class Manoeuvres:
     def resort(self, weights: Any, situation: Situation, kept: Judged) -> Committed:
         """Return the last resort, for a situation where nothing of the class is free.
 
-        It is the stop, if the stop is free or nothing in view is clear of all
-        obstacles. Otherwise it is what stays farthest away: the stop, the committed
-        reference, or a lateral move, with or without braking.
+        It is the stop, if the stop is free, if nothing leaves more room than it, as in
+        a lane that is too narrow, or if nothing in view is clear of all obstacles.
+        Otherwise it is what stays farthest away: the committed reference, or a lateral
+        move, with or without braking.
         """
         evasions = jnp.asarray([*product(ENDS, LENGTHS, BRAKING)])
         moves = jax.vmap(partial(self._evasion, situation))(*evasions.T)
@@ -277,9 +280,11 @@ class Manoeuvres:
         room = jnp.min(jnp.minimum(judged.gap, judged.edge), axis=1)
         beyond = 10.0 * jnp.maximum(judged.strain - 1.0, 0.0)
         worth = jnp.minimum(room, self.comfort) - beyond - 0.05 * judged.strain
+        best = jnp.argmax(worth)
         # A car that cannot avoid a collision brakes.
-        avoids = (room[0] < 0.0) & (jnp.max(worth) > -self.kind.margin)
-        chosen = jnp.where(avoids, jnp.argmax(worth), 0)
+        avoids = (room[0] < 0.0) & (worth[best] > -self.kind.margin)
+        avoids &= room[best] > room[0] + GAINED
+        chosen = jnp.where(avoids, best, 0)
         return jax.tree.map(lambda leaf: leaf[chosen], plans)
 
     def _evasion(

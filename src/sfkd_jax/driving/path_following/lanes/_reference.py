@@ -1,6 +1,7 @@
-"""A reference beside the centre line, on the samples of the road.
+"""A reference beside the centre line, on samples of the road.
 
-As the car drives on, the arrays move by whole samples, so no rounding accumulates.
+The samples are a fixed distance apart, whatever the spacing of the path. As the car
+drives on, the arrays move by whole samples, so no rounding accumulates.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sfkd_jax.driving.lanes import Lane
-from sfkd_jax.driving.paths import Lap, Path, point_at
+from sfkd_jax.driving.paths import SPACING, Lap, Path, point_at
 from sfkd_jax.types import Reference, Scalar
 
 BEHIND = 2
 """Samples behind the car: the projection of a measured position also goes back."""
 SPLICE = BEHIND + 2
 """The first sample at which a new plan may differ: it lies ahead of the car."""
+ROUNDED = 1e-3
+"""Share of a gap by which a sample may be beside the point of the path that it is."""
 STANDS = 1e-3
 """Speed below which nothing moves [m/s]."""
 
@@ -104,45 +107,118 @@ class Curve(NamedTuple):
     reached: Bool[Array, " sample"]
 
 
+def sampling(path: Path, spacing: float = SPACING) -> tuple[Scalar, Int[Array, ""]]:
+    """Return the distance of samples [m] and the number of gaps between them.
+
+    Points of the path are left out, or samples added between them. An open path is cut
+    to whole gaps. A lap is divided evenly, so that its last sample is its first one.
+
+    Args:
+        path: with any spacing of its own.
+        spacing: smallest distance of two samples [m].
+    """
+    ratio = path.spacing / spacing
+    added = jnp.maximum(jnp.floor(ratio + ROUNDED), 1.0)
+    points = jnp.maximum(jnp.ceil(1.0 / ratio - ROUNDED), 1.0)
+    gaps = jnp.floor((path.points.shape[0] - 1) * added / points)
+    gaps = jnp.maximum(gaps, 1.0)
+    distance = path.spacing * points / added
+    if isinstance(path, Lap):
+        # A lap of whole gaps keeps the spacing of its points to the last bit.
+        whole = gaps * points == (path.points.shape[0] - 1) * added
+        distance = jnp.where(whole, distance, path.length / gaps)
+    return distance, gaps.astype(int)
+
+
 def road_ahead(
-    lane: Lane, index: Int[Array, ""], count: int, accelerations: tuple[float, float]
+    lane: Lane,
+    index: Int[Array, ""],
+    count: int,
+    accelerations: tuple[float, float],
+    spacing: float = SPACING,
 ) -> RoadAhead:
     """Return the samples of a lane ahead; an open path ends at speed 0.
+
+    Edges and speed of a sample are the smallest of the lane from the sample before to
+    the one after it.
 
     Args:
         lane: on a path.
         index: of the first sample.
         count: number of samples.
         accelerations: largest acceleration and largest deceleration [m/s²].
+        spacing: smallest distance of two samples [m], see `sampling`.
     """
     path = lane.path
-    last = path.points.shape[0] - 1
+    distance, gaps = sampling(path, spacing)
     numbers = index + jnp.arange(count)
-    if isinstance(path, Lap):
-        rows = numbers % last
-        ended = False
-    else:
-        rows = jnp.clip(numbers, 0, last)
-        ended = numbers >= last
-    squares = jnp.where(ended, 0.0, lane.speed[rows] ** 2)
-    ahead = 2.0 * path.spacing * jnp.arange(count)
+    points = jax.vmap(point_at, in_axes=(None, 0))(path, distance * numbers)
+    left, right, speed = (
+        _smallest(path, values, numbers, distance, gaps)
+        for values in (lane.left, lane.right, lane.speed)
+    )
+    squares = speed**2
+    if not isinstance(path, Lap):
+        squares = jnp.where(numbers >= gaps, 0.0, squares)
+    ahead = 2.0 * distance * jnp.arange(count)
     gained = accelerations[0] * ahead
     lost = accelerations[1] * ahead
     # Backwards: at each sample the car can still slow down to all that follow.
     wanted = jax.lax.cummin(squares + lost, reverse=True) - lost
     # Forwards: at each sample the car has been able to speed up from all before.
     wanted = jax.lax.cummin(wanted - gained) + gained
-    x, y, yaw, curvature = path.points[rows].T
+    x, y, yaw, curvature = points.T
     return RoadAhead(
         position=jnp.stack([x, y]),
         direction=jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]),
         curvature=curvature,
-        slope=jnp.asarray(jnp.gradient(curvature)) / path.spacing,
-        left=lane.left[rows],
-        right=lane.right[rows],
+        slope=jnp.asarray(jnp.gradient(curvature)) / distance,
+        left=left,
+        right=right,
         wanted=wanted,
-        spacing=path.spacing,
+        spacing=distance,
     )
+
+
+def _smallest(
+    path: Path,
+    values: Float[Array, " point"],
+    numbers: Int[Array, " sample"],
+    distance: Scalar,
+    gaps: Int[Array, ""],
+) -> Float[Array, " sample"]:
+    """Return the smallest of values along a path within one gap of each sample.
+
+    Args:
+        path: with a value at each of its points.
+        values: linear between the points.
+        numbers: of the samples, rising by 1.
+        distance: of the samples [m].
+        gaps: number of gaps between the samples of the whole path.
+    """
+    last = values.shape[0] - 1
+    closed = isinstance(path, Lap)
+    first = numbers[0]
+    numbers = numbers % gaps if closed else jnp.clip(numbers, 0, gaps)
+    places = numbers * (distance / path.spacing)
+    rows = jnp.clip(jnp.floor(places + ROUNDED).astype(int), 0, last - 1)
+    # A sample at a point has its value to the last bit.
+    share = places - rows
+    share = jnp.where(jnp.abs(share) < ROUNDED, 0.0, jnp.clip(share, 0.0, 1.0))
+    between = (1.0 - share) * values[rows] + share * values[rows + 1]
+    # Points that lie between samples count for the samples on both sides.
+    points = jnp.arange(last + 1) * (path.spacing / distance)
+    before = jnp.floor(points + ROUNDED).astype(int) - first
+    after = jnp.ceil(points - ROUNDED).astype(int) - first
+    if closed:
+        before = before % gaps
+        after = after % gaps
+    # A negative index would count from the end.
+    beyond = numbers.shape[0]
+    for near in (before, after):
+        near = jnp.where(near < 0, beyond, near)
+        between = between.at[near].min(values, mode="drop")
+    return between
 
 
 def curve(road: RoadAhead, plan: Committed) -> Curve:
@@ -204,6 +280,7 @@ def speed_profile(
 
 def window(
     path: Path,
+    spacing: Scalar,
     committed: Committed,
     along: Curve,
     place: Scalar,
@@ -213,13 +290,13 @@ def window(
 
     Args:
         path: of the lane.
+        spacing: of the samples [m].
         committed: the reference.
         along: the same reference in the world.
         place: of the car, in samples.
         times: from now on [s].
     """
     squares = committed.square
-    spacing = path.spacing
     speed = jnp.sqrt(squares)
     accelerations = 0.5 * jnp.diff(squares) / along.lengths
     last = squares.shape[0] - 2
