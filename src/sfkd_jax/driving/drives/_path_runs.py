@@ -70,8 +70,12 @@ class Sensors(NamedTuple):
 
     init: Callable[[State, Control, Environment], Any]
     read: Callable[
-        [Any, Key, State, Control, Environment], tuple[Control, Reading, Any]
+        [Any, Key, State, Control, Environment], tuple[Control, Reading | None, Any]
     ]
+
+
+def _remember_nothing(state: State, inputs: Control, env: Environment) -> None:
+    """Return the memory of exact sensors."""
 
 
 def _read_exactly(
@@ -79,6 +83,10 @@ def _read_exactly(
 ) -> tuple[Float[Array, " 2"], None, Any]:
     """Return ν as it is, and no reading."""
     return inputs[PERTURBATION], None, memory
+
+
+EXACT = Sensors(_remember_nothing, _read_exactly)
+"""Of a law that knows its state."""
 
 
 def generate_along_path(
@@ -171,7 +179,7 @@ def drive_along_path(
     Returns:
         The runs, and what the law has read at every step, (run, time, …).
     """
-    read = _read_exactly if sensors is None else sensors.read
+    init, read = EXACT if sensors is None else sensors
     spread = jnp.asarray([steering_excitation, speed_excitation])
     drive = partial(random_drive, limits=limits, dt=loop.dt)
     if groups is None:
@@ -207,9 +215,7 @@ def drive_along_path(
             after = loop.step(state, control.at[PERTURBATION].set(nu), env)
             return (after, memory), (loop.shown(after), reading)
 
-        memory = None
-        if sensors is not None:
-            memory = sensors.init(start, controls[0], run_envs[0])
+        memory = init(start, controls[0], run_envs[0])
         _, (states, readings) = jax.lax.scan(
             step, (loop.whole(start), memory), (controls, run_envs, step_keys)
         )

@@ -8,6 +8,7 @@ from sfkd_jax.driving.plants._along_path import path_states as path_states
 from sfkd_jax.driving.plants._dynamic import dynamic as dynamic
 from sfkd_jax.driving.plants._kinematic import kinematic as kinematic
 from sfkd_jax.driving.plants._kinematic import kinematic_stiff as kinematic_stiff
+from sfkd_jax.driving.plants._late import Late as Late
 from sfkd_jax.driving.plants._late import LateState as LateState
 from sfkd_jax.driving.plants._late import late_loop as late_loop
 from sfkd_jax.driving.plants._own import check_step as check_step

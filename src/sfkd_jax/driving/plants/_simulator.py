@@ -216,9 +216,9 @@ def _settings_of(simulator: Any) -> dict[str, Any]:
     return stated
 
 
-def _size(settings: dict[str, Any]) -> int:
+def _size(stated: dict[str, Any]) -> int:
     """Return the number of entries of a state, those that are hidden included."""
-    return len(settings["state_names"]) + len(settings["hidden_names"])
+    return len(stated["state_names"]) + len(stated["hidden_names"])
 
 
 def _serve(channel: Connection) -> None:

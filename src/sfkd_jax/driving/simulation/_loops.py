@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.driving.path_coordinates import LATERAL, curvature_ahead, path_coordinates
 from sfkd_jax.driving.paths import project, reference_window
-from sfkd_jax.driving.plants import LateState, Vehicle, equivalent_wind, late_loop
+from sfkd_jax.driving.plants import Late, LateState, Vehicle, equivalent_wind, late_loop
 from sfkd_jax.driving.scenarios import (
     Scenario,
     car_clearance,
@@ -20,7 +20,7 @@ from sfkd_jax.driving.scenarios import (
     random_side_forces,
 )
 from sfkd_jax.driving.simulation.metrics import SIGNALS, Signal
-from sfkd_jax.info import reported
+from sfkd_jax.info import ControllerInfo, reported
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.ranges import Real
 from sfkd_jax.types import Controller, Key, Params, Reference, Scalar, State, Step
@@ -119,8 +119,8 @@ def simulate(
         shown = state[:observed]
         arrived, pending = late.observe(pending, jnp.append(shown, progress))
         # Noise reaches the controller alone, and neither plant nor scores.
-        noise = spread * jax.random.normal(sensor_key, shown.shape)
-        observation = arrived[:-1] + noise
+        noise = jax.random.normal(sensor_key, shown.shape)
+        observation = arrived[:-1] + spread * noise
         ahead = _ahead(scenario, arrived[-1], dt=dt, horizon=horizon)
         control, memory, info = controller.act(
             params, memory, observation, observed_env, ahead
@@ -134,18 +134,14 @@ def simulate(
             scenario.path, state[:2], progress + scenario.speed * dt
         )
         if scenario.course is not None:
-            assert size is not None
-            info = info._replace(gap=car_clearance(ahead[1], state, size=size))
-            if info.lane is not None:
-                # The first point is where the car should be now, if nothing is late.
-                lateral = _beside(info.lane.reference[late.observed_ago :], state)
+            info, lateral = _on_course(info, ahead, state, lateral, size, late)
         signals = {name: signal(info) for name, signal in recorded.items()}
         carry = (state, progress, memory, pending)
         return carry, (state[:observed], control, lateral, progress, signals)
 
     first = scenario.initial_state
     pending = late.init(jnp.append(first, 0.0))
-    whole = jnp.concatenate([first, jnp.zeros(hidden, first.dtype)])
+    whole = jnp.pad(first, (0, hidden))
     start = (whole, jnp.zeros(()), controller.init(planner_key), pending)
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
@@ -156,6 +152,32 @@ def _spread(levels: Sequence[float | Scalar], states: int) -> State:
     """Return the standard deviation of every state; 0 beyond those that are given."""
     known = jnp.asarray(levels, dtype=float)[:states]
     return jnp.zeros(states).at[: len(known)].set(known)
+
+
+def _on_course(
+    info: ControllerInfo,
+    ahead: Any,
+    state: State,
+    lateral: Scalar,
+    size: tuple[float, float] | None,
+    late: Late,
+) -> tuple[ControllerInfo, Scalar]:
+    """Return the info with the true gap to obstacles, and e_y beside the reference [m].
+
+    Args:
+        info: of the controller.
+        ahead: lane and obstacles.
+        state: after the step.
+        lateral: e_y of a controller that has no reference of its own [m].
+        size: length and width of the car [m].
+        late: sensors and actuators.
+    """
+    assert size is not None
+    info = info._replace(gap=car_clearance(ahead[1], state, size=size))
+    if info.lane is None:
+        return info, lateral
+    # The first point is where the car should be now, if nothing is late.
+    return info, _beside(info.lane.reference[late.observed_ago :], state)
 
 
 def _beside(reference: Reference, state: State) -> Scalar:

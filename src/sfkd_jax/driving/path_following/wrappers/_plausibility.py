@@ -112,11 +112,14 @@ class Yaw(NamedTuple):
 
     Attributes:
         plausible: whether it may be right.
+        explained: whether noise explains how it differs from what was expected; True
+            for the other coordinates.
         skew: by which angle it is wrong if it is not [rad].
         aside: mean lateral innovation while a yaw is refused [m].
     """
 
     plausible: Bool[Array, ""]
+    explained: Bool[Array, " coordinate"]
     skew: Scalar
     aside: Scalar
 
@@ -178,14 +181,9 @@ class Plausibility:
         compared = all_finite(expected)
         innovation = difference(observed, expected)
         limit = self._limit(state, periods, preview.on_time)
-        # Where no model predicted, the noise of its innovations says nothing.
-        modelled = state.modelled & preview.on_time
-        largest_turn = self.tests.largest_turn(state.tests)
-        largest_turn = jnp.where(modelled, largest_turn, jnp.inf)
         grown = limit * (1.0 + self.growth * state.missing)
-        yaw = self._yaw(state, innovation, grown[HEADING], largest_turn)
-        plausible = jnp.abs(innovation) <= grown
-        plausible = put(plausible, HEADING, yaw.plausible)
+        yaw = self._yaw(state, innovation, grown[HEADING], preview.on_time)
+        plausible = put(jnp.abs(innovation) <= grown, HEADING, yaw.plausible)
         moving = jnp.abs(expected[PATH_SPEED]) > MOVING
         seen = jnp.isfinite(observed) & ~(preview.repeated & moving)
 
@@ -194,33 +192,31 @@ class Plausibility:
         along = self._expected_along(state, preview)
         gap = preview.along - along
         slack = self._slack(state, periods, preview.on_time)
-        shifted = (jnp.abs(gap) > slack) & moving
+        shifted = moving & (jnp.abs(gap) > slack)
         earlier = self._earlier(state, observed, preview.road[0, 0], gap)
         late = jnp.all(seen & (jnp.abs(earlier.difference) <= AS_LATE * grown))
         late &= preview.on_time & shifted
         usable = seen & ~(late | (shifted & self._refuses(state)))
 
-        patience = jnp.where(late, PATIENCE_AHEAD, self.patience)
-        longest = jnp.round(patience / self.dt)
-        overdue = _overdue(state.missing >= longest, plausible)
+        longest = jnp.where(late, PATIENCE_AHEAD, self.patience) / self.dt
+        overdue = _overdue(state.missing >= jnp.round(longest), plausible)
         measured = usable & (plausible | overdue | ~compared)
         # Either this measurement or all that was believed before is wrong, and nothing
         # says which.
-        limit = put(limit, HEADING, jnp.minimum(limit[HEADING], largest_turn))
-        unexplained = ~(jnp.abs(innovation) <= limit) | shifted
-        forced = compared & jnp.any(measured & unexplained)
+        explained = (jnp.abs(innovation) <= limit) & ~shifted & yaw.explained
+        forced = compared & jnp.any(measured & ~explained)
         missing = jnp.where(measured, 0, state.missing + 1)
 
         xi = jnp.where(measured, observed, expected)
         xi = jnp.where(late, expected + earlier.difference_now, xi)
 
         skewed = compared & usable[HEADING] & ~(measured[LATERAL] & measured[HEADING])
-        heading = jnp.where(skewed, observed[HEADING] - yaw.skew, xi[HEADING])
-        xi = put(xi, HEADING, heading)
+        turned = observed[HEADING] - yaw.skew
+        xi = put(xi, HEADING, jnp.where(skewed, turned, xi[HEADING]))
         # A believed outlier starts anew; noise is averaged.
         estimate = expected + self.gain * difference(xi, expected)
         estimate = jnp.where(compared & (plausible | ~measured), estimate, xi)
-        here = jnp.append(estimate, preview.road[0, 0])
+        here = jnp.append(estimate, preview.road[0, 0])[None]
         past = jnp.where(late, earlier.past, state.past)
         # What is believed although it is far off starts anew.
         gain = jnp.where(shifted, 1.0, ALONG_GAIN)
@@ -230,10 +226,10 @@ class Plausibility:
             skew=jnp.where(skewed, yaw.skew, 0.0),
             aside=jnp.where(skewed & measured[LATERAL], yaw.aside, 0.0),
             doubt=jnp.where(forced, round(self.trial / self.dt), state.doubt),
-            past=jnp.concatenate([here[None], past[:-1]]),
+            past=jnp.concatenate([here, past[:-1]]),
         )
-        lost = jnp.any((missing > longest) & ~usable)
-        return Believed(xi, measured, along, lost, after)
+        lost = (missing > jnp.round(longest)) & ~usable
+        return Believed(xi, measured, along, jnp.any(lost), after)
 
     def _refuses(self, state: GateState) -> Bool[Array, ""]:
         """Return whether a position from another place of the path is refused.
@@ -255,7 +251,7 @@ class Plausibility:
         state: GateState,
         innovation: PathState,
         limit: Scalar,
-        largest_turn: Scalar,
+        on_time: Bool[Array, ""],
     ) -> Yaw:
         """Return whether a yaw is believed, and by which angle it else is wrong.
 
@@ -269,8 +265,11 @@ class Plausibility:
             state: of the gate after the last step.
             innovation: of ξ.
             limit: of the heading [rad].
-            largest_turn: see `MeasurementTests.largest_turn`.
+            on_time: whether the last call was one period ago.
         """
+        # Where no model predicted, the noise of its innovations says nothing.
+        largest_turn = self.tests.largest_turn(state.tests)
+        largest_turn = jnp.where(state.modelled & on_time, largest_turn, jnp.inf)
         turned = innovation[HEADING]
         skewed = state.skew != 0.0
         gap = jnp.abs(wrap_angle(turned - state.skew))
@@ -286,7 +285,13 @@ class Plausibility:
         half = jnp.maximum(0.5 * jnp.abs(skew) * way, COURSE_NOISE)
         confirmed = refused & stays & (aside * jnp.sign(skew) > half)
         plausible = (jnp.abs(turned) <= limit) & ~jumped
-        return Yaw(plausible | confirmed, skew, aside)
+        usual = jnp.ones(innovation.shape, bool)
+        return Yaw(
+            plausible=plausible | confirmed,
+            explained=put(usual, HEADING, jnp.abs(turned) <= largest_turn),
+            skew=skew,
+            aside=aside,
+        )
 
     def _earlier(
         self, state: GateState, xi: PathState, curvature: Scalar, gap: Scalar
