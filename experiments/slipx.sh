@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # From a 1/10 car that nobody here wrote to its corridor (docs/your-vehicle.md). The simulator is that of slipx
-# (examples/slipx_car.py), whose grip and side force switch, whose servo and tyres have states that no sensor shows,
-# and whose sensors are one step late. Beside the policy drive the law alone, Stanley's law and pure pursuit, and, on
-# time, MPPI with the textbook bicycle. The last line of the output is one line of JSON.
+# (examples/slipx_car.py), whose grip and side force switch, and whose servo and tyres have states that no sensor
+# shows. Beside the policy drive the law alone, MPPI with the textbook bicycle, Stanley's law and pure pursuit. The last
+# line of the output is one line of JSON.
 #
 #     bash experiments/slipx.sh [--small] [root=DIR and other Hydra overrides]
 set -euo pipefail
@@ -32,7 +32,7 @@ car=(
 )
 path=(
   +experiment=s3 name=slipx "${car[@]}"
-  'latency.sensors=[0.05]' 'dataset.law.points=[13,5,5]' controller=mppi_path_300
+  'dataset.law.points=[13,5,5]' controller=mppi_path_300
 )
 python -m sfkd_jax.train "${path[@]}" 'evaluation.systems=[self]' "$@"
 python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 \
