@@ -114,9 +114,9 @@ def write(
     if signing_key is not None:
         signature = asdict(_signature.sign(digest, signing_key))
     document = {**document, "sha256": digest, "signature": signature}
+    is_valid = isinstance(certificate, Certificate)
     # Here and not after hours, where somebody loads it.
-    kind: Any = type(certificate)
-    parse(store.plain(document), kind)
+    parse(store.plain(document), type(certificate) if is_valid else Certificate)
     store.write_json(path, document)
 
 

@@ -492,7 +492,9 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     build_with(late, latency=Latency((0.1,), (0.05,)))
     assert made["claimed"]
     assert made["tube"] == pytest.approx(0.12)
-    assert made["late"] == ((pytest.approx(0.5), pytest.approx(0.12)),)
+    # One that is less late than stated has that of the corridor on time.
+    on_time = (pytest.approx(-1.5), 0.06)
+    assert made["late"] == (on_time, (pytest.approx(0.5), pytest.approx(0.12)))
     build_with(late, latency=Latency((0.3,)))
     assert not made["claimed"]
     # Where only the sensors are later, e is known in time.
@@ -500,7 +502,7 @@ def test_the_box_of_a_certificate_holds_its_corridor(monkeypatch):
     late = replace(late, late_sensors=(replace(row, bounds=bounds),))
     build_with(late, latency=Latency((0.2,)))
     assert made["tube"] == pytest.approx(0.09)
-    assert made["late"] == ((0.0, pytest.approx(0.09)),)
+    assert made["late"] == ((-2.0, 0.06), (0.0, pytest.approx(0.09)))
     build_with(late, latency=Latency((), (0.2,)))
     assert made["tube"] == pytest.approx(0.12)
     # It is never narrower than that of a vehicle on time.
