@@ -34,6 +34,7 @@ class Highway:
 
     state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
     environment_names = ("grip [-]", "side force [kN]")
+    environment_roles = ("friction", "side_force")
     dt = 2 * SUBSTEP
     wheelbase = Bicycle.LENGTH
     control_low = (-0.5, -6.0)

@@ -25,6 +25,7 @@ class Slipx:
     state_names = ("p_x", "p_y", "yaw", "v", "v_y", "yaw_rate")
     hidden_names = ("steering", "steering_rate", *LAGS)
     environment_names = ("grip [-]", "side force [N]")
+    environment_roles = ("friction", "side_force")
     dt = 0.05
     wheelbase = 0.32
     speed = (1.5, 4.0)

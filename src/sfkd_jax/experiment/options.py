@@ -338,8 +338,11 @@ def parse_settings(values: Values) -> Settings:
     if simulator := getattr(vehicle, "env", None):
         stated = described(simulator)
         vehicle = replace(vehicle, **stated.arguments)
-        names = environment.names or stated.environment_names
-        environment = replace(environment, names=names)
+        environment = replace(
+            environment,
+            names=environment.names or stated.environment_names,
+            roles=environment.roles or stated.environment_roles,
+        )
     _check_env_names(environment)
     return replace(
         settings,

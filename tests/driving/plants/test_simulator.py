@@ -137,6 +137,7 @@ def test_the_bicycle_of_highway_env_is_driven_as_any_plant(tmp_path, monkeypatch
     chosen = run.settings
     assert (chosen.vehicle.dt, chosen.vehicle.wheelbase) == (0.1, 5.0)
     assert chosen.environment.names == ("grip [-]", "side force [kN]")
+    assert chosen.environment.roles == ("friction", "side_force")
     noise = chosen.evaluation.sensors(
         plants.own(state_names=("yaw_rate", "p_x", "load", "v"))
     )

@@ -131,6 +131,7 @@ def simulator(make: Make) -> Vehicle:
                                   default as many as there are cores
         timeout_s                 for a worker's part of a batch
         environment_names         of the entries of e, with units
+        environment_roles         what each of them is, see `roles_of`
         speed                     slowest and fastest reference speed [m/s]
 
     The step works under `jit`, `vmap` and `scan`, a batch at a time, and has no
@@ -151,11 +152,13 @@ class Described(NamedTuple):
     Attributes:
         arguments: of `own`.
         environment_names: names of the entries of e; () if it states none.
+        environment_roles: what each of them is; () if it states none.
         speed: range of the speeds that it is driven at [m/s]; None if it states none.
     """
 
     arguments: dict[str, Any]
     environment_names: tuple[str, ...]
+    environment_roles: tuple[str, ...]
     speed: tuple[float, float] | None
 
 
@@ -168,13 +171,14 @@ def described(make: Make) -> Described:
     """
     stated = dict(pool_of(make).settings)
     environment_names = stated.pop("environment_names")
+    environment_roles = stated.pop("environment_roles")
     speed = stated.pop("speed", None)
     if speed is not None and not (len(speed) == 2 and 0.0 < speed[0] < speed[1]):
         raise ValueError(
             f"vehicle.env={make}: its speed must be two rising numbers above 0 [m/s], "
             f"got {speed}"
         )
-    return Described(stated, environment_names, speed)
+    return Described(stated, environment_names, environment_roles, speed)
 
 
 def on_host(make: Make) -> Step:

@@ -209,10 +209,9 @@ def _settings_of(simulator: Any) -> dict[str, Any]:
         number_type = {"workers": int, "speed_loop": bool}.get(name, float)
         plain = np.asarray(value, number_type).tolist()
         stated[name] = tuple(plain) if isinstance(plain, list) else plain
-    environment_names = getattr(simulator, "environment_names", ())
-    stated["environment_names"] = tuple(map(str, environment_names))
     stated["state_names"] = tuple(map(str, simulator.state_names))
-    stated["hidden_names"] = tuple(map(str, getattr(simulator, "hidden_names", ())))
+    for name in ("hidden_names", "environment_names", "environment_roles"):
+        stated[name] = tuple(map(str, getattr(simulator, name, ())))
     return stated
 
 
