@@ -167,6 +167,14 @@ def test_every_table_of_numbers_is_made_from_a_committed_result():
         for name in ("your-vehicle", "failures")
     }
     assert errors in prose["your-vehicle"]
+    small = pages.read("experiments/slipx.json")
+    for words in (
+        "The corridor was {corridor_m} m,",
+        "and the error {rmse_mm} mm. The law alone had {law_rmse_mm} mm",
+        "the textbook bicycle {nominal_mppi_rmse_mm} mm, and Stanley's law "
+        "{stanley_rmse_mm} mm",
+    ):
+        assert words.format(**small) in prose["your-vehicle"]
     assert limit in prose["failures"]
     for page, text in pages.written().items():
         assert page.read_text("utf-8") == text, (
