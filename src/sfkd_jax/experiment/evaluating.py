@@ -272,9 +272,7 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
             f"scenario={run.settings.scenario.name} needs systems with a certified "
             f"corridor, and {name} has none: evaluation.systems=[self]"
         )
-    environment = run.settings.environment
-    names = [entry.label for entry in run.plant.environment]
-    roles = roles_of(environment.names or names, environment.roles)
+    roles = roles_of(_environment_names(run), run.settings.environment.roles)
     return assembly.build_in_lane(
         inner,
         run.plant,
@@ -285,6 +283,12 @@ def _in_lane(run: Run, name: str, system: System, inner: Controller) -> Controll
         planner="mppi",
         friction=roles.index(FRICTION) if FRICTION in roles else None,
     )
+
+
+def _environment_names(run: Run) -> list[str]:
+    """Return the names of the entries of e, with units."""
+    names = run.settings.environment.names
+    return list(names) or [entry.label for entry in run.plant.environment]
 
 
 def _columns(run: Run, name: str, system: System) -> Row:
@@ -300,6 +304,7 @@ def _columns(run: Run, name: str, system: System) -> Row:
         "planner": settings.controller.planner,
         "sampling": settings.controller.sampling,
         "env": system.env_source,
+        "env_names": _environment_names(run),
         "vehicle": settings.vehicle.name,
         "inner_loop": settings.vehicle.inner_loop,
         "latency": None if run.latency.is_none else str(run.latency),

@@ -14,6 +14,9 @@ from sfkd_jax.driving.simulation.metrics import Row, switches
 from sfkd_jax.report.style import family, rank
 from sfkd_jax.report.tables import name_of
 
+ENV_NAMES = ("friction [-]", "side wind [m/s]")
+"""Entries of e in results that do not name them."""
+
 
 class Episodes(NamedTuple):
     """The stored episodes of a row.
@@ -43,6 +46,12 @@ class Episodes(NamedTuple):
     def system(self) -> str:
         """Name of the system, without its coordinates."""
         return family(str(self.row.get("system")))
+
+    @property
+    def env_names(self) -> list[str]:
+        """Names of the entries of e, with units."""
+        names = self.row.get("env_names") or ENV_NAMES
+        return [str(name)[:30] for name in names]
 
     @property
     def switches(self) -> list[int]:

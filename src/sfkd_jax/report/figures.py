@@ -48,7 +48,7 @@ def first_episode(
     axes[0].set_title("Lateral error in the first episode")
     _draw_errors(axes[0], group, last, corridor)
     if envs is not None:
-        _draw_conditions(axes[1], axes[2], envs[:last], first.dt)
+        _draw_conditions(axes[1:], first.env_names, envs[:last], first.dt)
     for panel in axes:
         panel.set(xlim=(0.0, last * first.dt))
         panel.grid(visible=False, axis="x")
@@ -61,17 +61,20 @@ def first_episode(
 
 
 def _draw_conditions(
-    friction: Any, wind: Any, envs: Float[np.ndarray, "time 2"], dt: float
+    panels: list[Any], names: list[str], envs: Float[np.ndarray, "time 2"], dt: float
 ) -> None:
-    """Draw friction and wind over time, each on its own axes."""
+    """Draw friction and wind, or what e is, over time, each on its own axes."""
     time = dt * np.arange(len(envs) + 1)
-    for axes, values in zip((friction, wind), envs.T, strict=True):
+    for axes, values, name in zip(panels, envs.T, names, strict=False):
+        axes.set_ylabel(name.replace(" [", "\n["))
         fill = {"baseline": 0.0, "fill": True, "color": "#b9c6d6", "linewidth": 0.0}
         axes.stairs(values, time, **fill)
         axes.stairs(values, time, baseline=None, color="#4a5a6d", linewidth=1.1)
-    friction.set(ylim=(0.0, 1.0), yticks=[0.0, 0.5, 1.0], ylabel="friction\n[-]")
+    friction, wind = panels
+    top = max(1.0, 1.05 * float(np.max(envs[:, 0])))
+    friction.set(ylim=(0.0, top), yticks=[0.0, 0.5, 1.0])
     peak = max(1.0, float(np.max(np.abs(envs[:, 1]))))
-    wind.set(ylim=(-1.15 * peak, 1.15 * peak), ylabel="side wind\n[m/s]")
+    wind.set(ylim=(-1.15 * peak, 1.15 * peak))
     wind.yaxis.set_major_locator(MaxNLocator(nbins=2, symmetric=True))
 
 
