@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.driving.certificate import LawMargins
 from sfkd_jax.driving.corridor._closed_loop import Loop, spread_of
 from sfkd_jax.driving.path_coordinates import LATERAL
-from sfkd_jax.driving.path_following import by_differences
+from sfkd_jax.driving.path_following import by_differences, expected_coordinates
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.types import BODY
 
@@ -111,15 +111,14 @@ def linearised(
     size = steady.state.shape[0]
 
     def advance(turn: Array) -> Array:
-        inputs = jnp.concatenate([turn[size:], road])
-        state = without_pose(turn[:size])
+        xi, nu = jnp.split(turn, [size])
         # A turn is not steady in states that nobody knows; the model has no others.
         if loop.plant.hidden:
             model = loop.model.predicting
             fiber = model.fiber(loop.params, env)
-            latent = model.step(fiber, model.encode(fiber, state), inputs)
-            return model.decode(fiber, latent)[BODY]
-        return loop.plant.step(state, inputs, env)[BODY]
+            return expected_coordinates(model, fiber, xi, nu, road)
+        inputs = jnp.concatenate([nu, road])
+        return loop.plant.step(without_pose(xi), inputs, env)[BODY]
 
     # Of the closed loop, whose inputs are ν: A − B K and B.
     at = jnp.concatenate([steady.state, jnp.zeros(2)])
