@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 
 from sfkd_jax.certification._search import prove_claims
-from sfkd_jax.types import Declared, Explicit, Polytope
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
+from sfkd_jax.types import BODY_FRAME, Declared, Explicit, Polytope
 
 
 def rotation(size, seed=0):
@@ -54,7 +55,12 @@ TURNED = NETWORK._replace(
 @cache
 def honest(kind="network"):
     """What the search finds, which takes most of the time."""
-    return prove_claims(KINDS[kind])
+    return prove_claims(KINDS[kind], frame_of(KINDS[kind]))
+
+
+def frame_of(weights):
+    """With a pose if there is a decoder of it."""
+    return BODY_FRAME if weights.decoder else PATH_FRAME
 
 
 def consistent(claims):

@@ -60,7 +60,7 @@ def test_printed_it_says_where_it_applies_and_what_of_it_is_proved(vehicle):
     (proved,) = (line for line in text.splitlines() if "proved" in line)
     (measured,) = (line for line in text.splitlines() if "measured, unsigned" in line)
     assert f"alpha {document.proof.alpha:.4f}" in proved
-    assert f"{document.measured.d_bar.one_step.latent:.3g}" in measured
+    assert f"{document.measured.d_bar.one_step['latent']:.3g}" in measured
     if "_" in vehicle:
         for fact in ("v_ref [m/s] 3 … 12", "curvature [1/m] -0.05 … 0.05", "3 to 6 s"):
             assert fact in text

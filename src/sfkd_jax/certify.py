@@ -34,7 +34,7 @@ def main(run: Run) -> dict[str, Any]:
     return {
         "certificate": str(path),
         "reason": None,
-        "d_bar": certificate.measured.d_bar.one_step.latent,
+        "d_bar": certificate.measured.d_bar.one_step["latent"],
         "valid": True,
         "alpha": proof.alpha,
         "alpha_separate": proof.alpha_separate,

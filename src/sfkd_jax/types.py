@@ -12,7 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sfkd_jax.info import ControllerInfo
 
@@ -57,31 +58,82 @@ class Frame:
         inputs: number of entries of ρ, the last entries of a control.
         following: (ρ, size of the body state) -> body state of a system that follows
             its reference exactly; a planner's model is linearised there.
-        outputs: entries of a state, for each output that a certificate bounds.
+        outputs: entries of a state, for each output that a certificate bounds, by any
+            names. The error of an output is the 2-norm of the errors of its entries.
+            The output "body" is what is left of a state, in mixed units; there may be
+            none.
+        units: unit of each output, "" for none.
         angles: entries of a state that are angles [rad].
         lengths: what an error of 1 in each of the first entries of a state counts in a
-            training loss [m].
+            training loss [m]; of three entries or more.
         length: what half the width of any other entry counts there [m].
+        distances: those of the entries with `lengths` that are distances. They count
+            relative to the size of the system.
+
+    Raises:
+        ValueError: these do not fit together; names the frame and the attribute.
     """
 
     name: str
     has_pose: bool
-    outputs: Mapping[str, slice]
+    outputs: Mapping[str, slice | tuple[int, ...]]
+    units: Mapping[str, str]
     angles: tuple[int, ...]
     lengths: tuple[float, ...]
     length: float
+    distances: tuple[int, ...]
     inputs: int = 0
     following: Callable[[Control, int], Float[Array, " body"]] = _at_zero
+
+    def __post_init__(self) -> None:
+        """Refuse attributes that do not fit together."""
+        where = f"frame {self.name!r}:"
+        if self.units.keys() != self.outputs.keys():
+            raise ValueError(
+                f"{where} units are of {[*self.units]}, outputs {[*self.outputs]}"
+            )
+        if len({*self.labels.values()}) < len(self.outputs):
+            raise ValueError(
+                f"{where} outputs with their units must differ, got "
+                f"{[*self.labels.values()]}"
+            )
+        if len(self.lengths) < BODY.start:
+            raise ValueError(
+                f"{where} lengths must be of at least {BODY.start} entries, got "
+                f"{len(self.lengths)}"
+            )
+        # An entry that counts by its half width is relative to the size already.
+        if not {*self.distances} <= {*range(len(self.lengths))}:
+            raise ValueError(
+                f"{where} distances must be among the {len(self.lengths)} entries with "
+                f"lengths, got {self.distances}"
+            )
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The name of each output with its unit, such as "position_m"."""
+        return {
+            name: f"{name}_{unit}" if unit else name
+            for name, unit in self.units.items()
+        }
+
+    def entries(self, output: str) -> slice | Int[np.ndarray, " entry"]:
+        """Return the index of the entries of an output, along an axis of states."""
+        entries = self.outputs[output]
+        # A tuple would be an index of several axes.
+        return entries if isinstance(entries, slice) else np.asarray(entries, int)
 
 
 BODY_FRAME = Frame(
     name="body",
     has_pose=True,
     outputs={"position": slice(0, 2), "yaw": slice(2, 3), "body": BODY},
+    units={"position": "m", "yaw": "rad", "body": ""},
     angles=(2,),
     # A radian counts the way of half a second at 10 m/s.
     lengths=(1.0, 1.0, 5.0),
     length=0.2,
+    distances=(0, 1),
 )
 """The frame of the body: a step moves the pose by an increment that does not depend on
 the pose, and nothing refers to a reference.

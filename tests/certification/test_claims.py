@@ -5,7 +5,16 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from networks import FIRST, KINDS, LAST, NETWORK, POLYTOPE, consistent, honest
+from networks import (
+    FIRST,
+    KINDS,
+    LAST,
+    NETWORK,
+    POLYTOPE,
+    consistent,
+    frame_of,
+    honest,
+)
 
 from sfkd_jax.certificate import Claims
 from sfkd_jax.certificate._reading import read_as
@@ -25,13 +34,13 @@ def on_one_thread():
 
 def refuted(claims, weights, named):
     with pytest.raises(CertificationRefused) as reason:
-        require_claims(claims, weights)
+        require_claims(claims, weights, frame_of(weights))
     assert named in str(reason.value)
 
 
 @every_kind
 def test_what_was_proved_holds(kind):
-    require_claims(honest(kind), KINDS[kind])
+    require_claims(honest(kind), KINDS[kind], frame_of(KINDS[kind]))
     read = read_as(Claims, json.loads(json.dumps(asdict(honest(kind)))))
     assert read == honest(kind)
 
@@ -81,7 +90,8 @@ def test_a_smaller_constant_does_not_follow_and_a_larger_one_does(kind, name):
     for factor in (0.5, 1 - 4e-6):
         smaller = consistent(replaced(claims, name, factor * value))
         refuted(smaller, weights, f"{name} does not follow")
-    require_claims(consistent(replaced(claims, name, 1.001 * value)), weights)
+    larger = consistent(replaced(claims, name, 1.001 * value))
+    require_claims(larger, weights, frame_of(weights))
 
 
 @pytest.mark.parametrize("name", ["alpha", "alpha_separate"])
@@ -95,7 +105,7 @@ def test_what_is_arithmetic_must_be_exact(name):
 def test_alpha_is_the_smaller_of_both():
     loose = replace(honest(), alpha_joint=2.0)
     refuted(replace(loose, alpha=2.0), NETWORK, "alpha does not follow")
-    require_claims(consistent(loose), NETWORK)
+    require_claims(consistent(loose), NETWORK, frame_of(NETWORK))
 
 
 @pytest.mark.parametrize("vertex", range(3))

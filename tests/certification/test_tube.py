@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from helpers import certified, driven, jit, model_and_params
 
-from sfkd_jax.certificate import StepErrors
 from sfkd_jax.certification import latent_tube
-from sfkd_jax.certification._measured import RESIDUALS, residuals
+from sfkd_jax.certification._measured import residuals
 from sfkd_jax.certification._tubes import tubes
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.rollout import rollout
+from sfkd_jax.types import BODY_FRAME
 
 
 @pytest.mark.parametrize(
@@ -27,16 +28,16 @@ def test_the_physical_tube_is_its_finite_sums():
     given = {
         "alpha": 0.5,
         "lipschitz": {"position": 2.0, "yaw": 0.5, "body": 3.0},
-        "one_step": StepErrors(latent=2.0, position=0.1, yaw=0.01, body=0.2),
+        "one_step": {"latent": 2.0, "position": 0.1, "yaw": 0.01, "body": 0.2},
         "horizon": 3,
     }
-    tube = tubes(**given, largest_increment=10.0).physical
+    tube = tubes(**given, frame=BODY_FRAME, largest_increment=10.0).physical
     yaw = [0.01, 0.02 + 1.0, 0.03 + 2.5]
     np.testing.assert_allclose(tube["yaw_rad"], yaw)
     position = [0.1, 0.2 + 4.0 + 10 * yaw[0], 0.3 + 10.0 + 10 * (yaw[0] + yaw[1])]
     np.testing.assert_allclose(tube["position_m"], position)
     np.testing.assert_allclose(tube["body"], [0.2, 0.2 + 3.0, 0.2 + 4.5])
-    along = tubes(**given, largest_increment=None)
+    along = tubes(**given, frame=PATH_FRAME, largest_increment=None)
     np.testing.assert_allclose(along.physical["position_m"], [0.1, 2.1, 3.1])
     assert along.ultimate == 4.0
     assert along.asymptotic == pytest.approx(
@@ -51,9 +52,8 @@ def test_free_running_predictions_stay_inside_the_physical_tube():
     """
     model, params = model_and_params("sfkd")
     data, proved = driven(24), certified("sfkd")
-    measured = dict(
-        zip(RESIDUALS, residuals(model, params, data).largest().T, strict=True)
-    )
+    errors = residuals(model, params, data)
+    measured = dict(zip(errors.names, errors.largest().T, strict=True))
     each = jit(jax.vmap(lambda one: rollout(model, params, one).free))
     predicted = np.asarray(each(data))
     true = np.asarray(data.states)[:, 1:]
@@ -65,9 +65,8 @@ def test_free_running_predictions_stay_inside_the_physical_tube():
         tube = tubes(
             alpha=proved.alpha,
             lipschitz=proved.lipschitz,
-            one_step=StepErrors(
-                **{kind: float(measured[kind][k]) for kind in RESIDUALS}
-            ),
+            frame=BODY_FRAME,
+            one_step={kind: float(measured[kind][k]) for kind in measured},
             horizon=12,
             largest_increment=float(moves[k].max()),
         ).physical

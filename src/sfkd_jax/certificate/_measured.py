@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from sfkd_jax.certificate._proof import Box, Row
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, UnitInterval
@@ -51,21 +52,10 @@ class Boxes:
     names: AxisNames | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class StepErrors:
-    """Bounds on the errors of single steps.
-
-    Attributes:
-        latent: d̄, in the latent space.
-        position: of the output "position" [m].
-        yaw: of the output "yaw" [rad].
-        body: of the body state.
-    """
-
-    latent: NonNegative
-    position: NonNegative
-    yaw: NonNegative
-    body: NonNegative
+StepErrors: TypeAlias = dict[str, NonNegative]
+"""Bounds on the errors of single steps: "latent" for d̄, in the latent space, and one
+for each output of the frame of the model, by its name and in its unit.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +89,8 @@ class Tube:
 
     Attributes:
         latent: R_1 … R_T.
-        physical: radii of "position_m" [m], "yaw_rad" [rad] and "body".
+        physical: radii of the outputs, by their names with their units, such as
+            "position_m".
         ultimate: d̄ / (1 − α), the limit of R_k.
         asymptotic: limits of the physical radii; None for increments, which add up.
         largest_increment_m: longest step [m]; None without a pose.
@@ -117,7 +108,7 @@ class OutputBound:
     """A bound of |y_k − ŷ_k| over a whole new run.
 
     Attributes:
-        radius: the bound [m or rad].
+        radius: the bound, in the unit of the output.
         coverage: on the test part.
     """
 
@@ -146,7 +137,7 @@ class Measured:
         boxes: of the data.
         d_bar: bounds on single steps.
         tube: around predictions.
-        outputs: tubes of the outputs that have a metric, by name.
+        outputs: tubes of the outputs that have a metric in the proof, by name.
     """
 
     boxes: Boxes

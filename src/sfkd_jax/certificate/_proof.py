@@ -45,8 +45,8 @@ class Claims:
         alpha_joint: of z ↦ A(e) z + r(z; u, e) as one map.
         rho: ρ = sup_e ||A(e)||.
         beta: β, the Lipschitz constant of the residual r in z.
-        lipschitz: Lipschitz constants of the outputs "position" [m], "yaw" [rad], both
-            together ("decoder", with a decoder of the pose) and "body".
+        lipschitz: Lipschitz constants of the outputs of the frame, by name, and of
+            "decoder", position and yaw together, if a decoder gives the pose.
         witnesses: multipliers of all proofs.
     """
 
@@ -65,13 +65,13 @@ class OutputMetric:
     """Constants in the metric of one output.
 
     The 2-norm weighs all directions of the latent alike, but an output depends on some
-    of them only. With a P chosen for its row c of the read-out, the tube
-    |c z| ≤ |c|_{P⁻¹} R of the same weights is several times tighter. This is the
+    of them only. With a P chosen for its rows C of the read-out, the tube
+    |C z| ≤ |C|_{P⁻¹} R of the same weights is several times tighter. This is the
     closed-loop tube of Singh et al. 2017, for one output at a time.
 
     Attributes:
         alpha: α, with |F(z) − F(z')|_P ≤ α |z − z'|_P for all z, z', w and e.
-        lipschitz: L, with |C z| ≤ L |z|_P for the output C z [m or rad].
+        lipschitz: L, with |C z| ≤ L |z|_P for the output C z, in its unit.
         metric: P, (rank, rank), of the size 1.
         joint: multipliers of every vertex that prove α.
     """
@@ -122,7 +122,8 @@ class Proof(Claims):
         transport_lipschitz: Lipschitz constant of T(e → e').
         lyapunov: common Lyapunov function of the operators, or None.
         lyapunov_refused: reason why there is none, or None.
-        outputs: metrics of e_y ("position") and e_ψ ("yaw"), or none.
+        outputs: metrics of all outputs but "body", by name, or none. With a pose there
+            are none.
         env_box: E.
         params_sha256: hash of the weights.
         precision: how the rounding of numbers is accounted for.

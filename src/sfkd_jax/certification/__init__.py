@@ -17,7 +17,6 @@ from sfkd_jax.certification._measured import coverage as coverage
 from sfkd_jax.certification._measured import residuals as residuals
 from sfkd_jax.certification._measuring import boxes_of as boxes_of
 from sfkd_jax.certification._measuring import measure as measure
-from sfkd_jax.certification._metric_claims import OUTPUTS as OUTPUTS
 from sfkd_jax.certification._proving import prove as prove
 from sfkd_jax.certification._proving import verify_proof as verify_proof
 from sfkd_jax.certification._search import lipschitz_upper as lipschitz_upper

@@ -218,13 +218,13 @@ def _norms_of_outputs(jacobians: list[Matrix], frame: Frame) -> dict[str, float]
         # Decoded, and with the pose after a step in place of the decoded one.
         decoded = jacobian[3:]
         states += [decoded, np.concatenate([jacobian[:3], decoded[BODY]])]
-    norms = {name: _largest_norm(states, rows) for name, rows in frame.outputs.items()}
+    norms = {name: _largest_norm(states, frame.entries(name)) for name in frame.outputs}
     if frame.has_pose:
         norms["decoder"] = _largest_norm(states, POSE)
     return norms
 
 
-def _largest_norm(jacobians: Any, rows: slice = slice(None)) -> float:
+def _largest_norm(jacobians: Any, rows: Any = slice(None)) -> float:
     """Return the largest 2-norm of these rows of the matrices."""
     return max(float(np.linalg.norm(jacobian[rows], 2)) for jacobian in jacobians)
 

@@ -11,6 +11,7 @@ import numpy as np
 from sfkd_jax.certificate import Box, Claims, Multipliers
 from sfkd_jax.certification._core import Matrix, Vector, check_vertices, check_witness
 from sfkd_jax.certification._weights import Exported, require, require_all
+from sfkd_jax.types import BODY, Frame
 
 COMPILATION_SLACK = 1.0 + 1e-6
 """Factor on constants. Explicit weights are computed with slightly different rounding
@@ -33,18 +34,19 @@ def with_room(weights: Exported, room: float = 1.0001) -> Exported:
     return weights._replace(residual=residual, decoder=decoder)
 
 
-def require_claims(claims: Claims, weights: Exported) -> None:
+def require_claims(claims: Claims, weights: Exported, frame: Frame) -> None:
     """Refuse the first claim in the 2-norm that does not follow from its witness.
 
     Args:
         claims: from an untrusted source.
         weights: that they are about.
+        frame: of the model.
 
     Raises:
         CertificationRefused: a claim does not follow.
     """
     _require_bounds(claims)
-    linear = readouts(weights)
+    linear = readouts(weights, frame)
     networks = decoders(weights)
     # Exactly these outputs: a missing one would be unbounded, another one meaningless.
     expected = [*linear, *networks]
@@ -78,17 +80,21 @@ def require_claims(claims: Claims, weights: Exported) -> None:
     for name, rows in linear.items():
         bound = claims.lipschitz[name]
         # A read-out of zeros has the constant 0, which no strict inequality proves.
-        checks[name] = not np.any(rows) or check_witness((), (), bound, rows)
+        holds = not np.any(rows) or check_witness((), (), bound, rows)
+        # An output may have the name of a constant, and must not replace its check.
+        checks[f"lipschitz.{name}"] = holds
     for name, network in networks.items():
         multipliers = vectors(witnesses.decoders[name])
-        checks[name] = _bounded(network, multipliers, claims.lipschitz[name])
+        holds = _bounded(network, multipliers, claims.lipschitz[name])
+        checks[f"lipschitz.{name}"] = holds
     require_all(checks)
 
 
 def _require_bounds(claims: Claims) -> None:
     """Refuse a constant that is no number between 0 and infinity."""
     constants = {name: getattr(claims, name) for name in CONSTANTS}
-    constants.update(claims.lipschitz)
+    for name, value in claims.lipschitz.items():
+        constants[f"lipschitz.{name}"] = value
     for name, value in constants.items():
         is_bound = isinstance(value, int | float) and 0 <= value < math.inf
         require(is_bound, f"{name} is not a bound: {value!r}")
@@ -137,16 +143,18 @@ def hull_scope(weights: Exported) -> str:
     return f"all e: A(e) lies in the hull of {count} vertices; all u, all z"
 
 
-def readouts(weights: Exported) -> dict[str, Matrix]:
+def readouts(weights: Exported, frame: Frame) -> dict[str, Matrix]:
     """Return the rows of the linear read-out by the names of the outputs.
 
     If a decoder gives the pose, the read-out gives the body state alone. Without a pose
-    it gives the outputs "position" and "yaw", and the rest of the body state.
+    it gives every output of the frame.
     """
-    rows = weights.readout
-    if weights.decoder:
-        return {"body": rows}
-    return {"position": rows[:1], "yaw": rows[1:2], "body": rows[2:]}
+    if frame.has_pose:
+        return {"body": weights.readout}
+    # The entries of an output count those of the pose, which are always 0.
+    pose = np.zeros((BODY.start, weights.readout.shape[1]))
+    state = np.concatenate([pose, weights.readout])
+    return {name: state[frame.entries(name)] for name in frame.outputs}
 
 
 def decoders(weights: Exported) -> dict[str, list[Matrix]]:

@@ -17,8 +17,6 @@ from sfkd_jax.geometry import between
 from sfkd_jax.rollout import rollout
 from sfkd_jax.types import BODY, POSE, Model, Params, Trajectory
 
-RESIDUALS = ("latent", "position", "yaw", "body")
-"""Names of the errors of a step that are bounded."""
 ROUNDING = 1e-9
 """Far above the rounding error of a share times a count."""
 BATCH = 50
@@ -34,19 +32,24 @@ class Residuals(NamedTuple):
 
     Attributes:
         gaps: d_k in latent coordinates.
-        outputs: 2-norms of the errors of the outputs of the frame, see `Frame.outputs`.
+        outputs: 2-norms of the errors of each output of the frame, by its name.
     """
 
     gaps: Float[np.ndarray, "run time rank"]
-    outputs: Float[np.ndarray, "run time 3"]
+    outputs: dict[str, Float[np.ndarray, "run time"]]
 
-    def largest(self) -> Float[np.ndarray, "run 4"]:
-        """Return the largest errors of each run, in the order of `RESIDUALS`.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the errors of a step that are bounded."""
+        return ("latent", *self.outputs)
+
+    def largest(self) -> Float[np.ndarray, "run error"]:
+        """Return the largest errors of each run, in the order of `names`.
 
         The bounds are about whole runs, and not about single steps.
         """
-        sizes = np.linalg.norm(self.gaps, axis=-1)
-        return np.column_stack([np.max(sizes, axis=1), np.max(self.outputs, axis=1)])
+        sizes = [np.linalg.norm(self.gaps, axis=-1), *self.outputs.values()]
+        return np.column_stack([np.max(errors, axis=1) for errors in sizes])
 
 
 def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
@@ -65,14 +68,19 @@ def residuals(model: Model, params: Params, runs: Trajectory) -> Residuals:
         gaps_of_batch, outputs_of_batch = _errors(model, params, batch)
         gaps.append(np.asarray(gaps_of_batch, np.float64))
         outputs.append(np.asarray(outputs_of_batch, np.float64))
+    of_outputs = np.moveaxis(np.concatenate(outputs)[:count], -1, 0)
     return Residuals(
-        gaps=np.concatenate(gaps)[:count], outputs=np.concatenate(outputs)[:count]
+        gaps=np.concatenate(gaps)[:count],
+        outputs=dict(zip(model.frame.outputs, of_outputs, strict=True)),
     )
 
 
 @partial(jax.jit, static_argnums=0)
 def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Array]:
-    """Return the fields of `Residuals` for one batch of fixed size."""
+    """Return the fields of `Residuals` for one batch of fixed size.
+
+    The outputs are the last axis, in the order of the frame.
+    """
 
     def errors_of_run(run: Trajectory) -> tuple[Array, Array]:
         predictions = rollout(model, params, run)
@@ -87,8 +95,8 @@ def _errors(model: Model, params: Params, runs: Trajectory) -> tuple[Array, Arra
             motion -= motion_of(before[:, POSE], after[:, POSE])
             errors = jnp.concatenate([motion, errors[:, BODY]], axis=1)
         norms = [
-            jnp.linalg.norm(errors[:, entries], axis=1)
-            for entries in model.frame.outputs.values()
+            jnp.linalg.norm(errors[:, model.frame.entries(name)], axis=1)
+            for name in model.frame.outputs
         ]
         return predictions.defects, jnp.stack(norms, 1)
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.certificate import Box, Boxes, Measured, Proof, StepBounds, StepErrors
+from sfkd_jax.certificate import Box, Boxes, Measured, Proof, StepBounds
 from sfkd_jax.certification._measured import (
-    RESIDUALS,
     Residuals,
     conformal_bounds,
     coverage,
@@ -71,6 +70,7 @@ def measure(
     tube = tubes(
         alpha=proof.alpha,
         lipschitz=proof.lipschitz,
+        frame=model.frame,
         one_step=d_bar.one_step,
         horizon=horizon,
         largest_increment=_longest_step(calibration) if model.frame.has_pose else None,
@@ -137,7 +137,7 @@ def _step_bounds(
         shares[name] = coverage(bounds, part.largest(), count)
     independent = runs.get("calibration", len(scores))
     return StepBounds(
-        one_step=StepErrors(**dict(zip(RESIDUALS, bounds.tolist(), strict=True))),
+        one_step=dict(zip(measured.names, bounds.tolist(), strict=True)),
         level=level,
         trajectories=len(scores),
         runs=independent,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -18,13 +19,10 @@ from sfkd_jax.certification._core import (
     product,
 )
 from sfkd_jax.certification._weights import Exported, require, require_all
+from sfkd_jax.types import Frame
 
-OUTPUTS = ("position", "yaw")
-"""Outputs with metrics of their own: e_y [m] and e_ψ [rad]."""
 UNIT_ERROR = 1e-9
 """Largest error of the size of P, which is 1 by convention."""
-
-
 ROTATES = "P = I is the only metric that the transport keeps: c_1 = c_2 = 1"
 """Reason why a model that rotates its latent has no other metric."""
 
@@ -37,20 +35,57 @@ def keeps_metrics(weights: Exported) -> bool:
     return weights.declared.transport == "identity"
 
 
-def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> None:
+def outputs_with_metric(weights: Exported, frame: Frame) -> tuple[str, ...]:
+    """Return the names of the outputs that have a metric of their own.
+
+    They are all outputs but "body", whose entries have mixed units. With a pose, or a
+    transport that keeps the 2-norm alone, there are none.
+    """
+    # A decoder gives the pose, which is then no linear output of z.
+    if frame.has_pose or not keeps_metrics(weights):
+        return ()
+    return tuple(name for name in frame.outputs if name != "body")
+
+
+def require_output_metrics(
+    claims: Mapping[str, OutputMetric], weights: Exported, frame: Frame
+) -> None:
+    """Refuse metrics unless they are of all outputs, or of none, and hold.
+
+    Args:
+        claims: from an untrusted source, by output.
+        weights: that they are about.
+        frame: of the model.
+
+    Raises:
+        CertificationRefused: an output is missing, or a claim does not follow.
+    """
+    for name, claim in claims.items():
+        require_output_metric(name, claim, weights, frame)
+    # None is no false claim: a search may find nothing.
+    expected = outputs_with_metric(weights, frame)
+    require(
+        not claims or {*claims} == {*expected},
+        f"outputs must be {', '.join(expected)}, got {[*claims]}",
+    )
+
+
+def require_output_metric(
+    name: str, claim: OutputMetric, weights: Exported, frame: Frame
+) -> None:
     """Refuse a constant that does not follow from P and the multipliers.
 
     Args:
         name: of the output.
         claim: from an untrusted source.
         weights: that it is about.
+        frame: of the model.
 
     Raises:
         CertificationRefused: a constant does not follow.
     """
     where = f"outputs.{name}"
-    # With a decoder the pose is no linear output of z, and no metric is about it.
-    exists = name in OUTPUTS and keeps_metrics(weights) and not weights.decoder
+    exists = name in outputs_with_metric(weights, frame)
     require(exists, f"{where}: this model has no such metric")
     for constant in ("alpha", "lipschitz"):
         value = getattr(claim, constant)
@@ -60,8 +95,7 @@ def require_output_metric(name: str, claim: OutputMetric, weights: Exported) -> 
     metric = np.asarray(claim.metric)
     fits = metric.shape == weights.operators.vertices.shape[1:]
     require(fits, f"{where}.metric is of another size than the weights")
-    rows = readouts(weights)[name]
-
+    rows = readouts(weights, frame)[name]
     checks = {
         "alpha": claim.alpha < 1.0 and contracts(claim, weights),
         "lipschitz": reads_within(rows, claim.lipschitz, metric),

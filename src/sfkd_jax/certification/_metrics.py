@@ -315,6 +315,7 @@ def _log_radius(
     squares = jnp.maximum(squares_at(jnp.exp(logs), operators), 1e-12).reshape(-1)
     alpha = jnp.sqrt(_power_sum(squares, sharpness))
     solved = jax.scipy.linalg.solve_triangular(factor, read, lower=True)
+    # Of several rows the Frobenius norm, which is smooth where singular values cross.
     gain = jnp.linalg.norm(solved)
     sizes = jnp.linalg.norm(gaps @ factor, axis=-1)
     worst_of_runs = jax.vmap(partial(_power_sum, power=POWER_OVER_STEPS))(sizes)

@@ -18,10 +18,9 @@ from sfkd_jax.certification._claims import (
 )
 from sfkd_jax.certification._measured import residuals, worst_gaps
 from sfkd_jax.certification._metric_claims import (
-    OUTPUTS,
-    keeps_metrics,
+    outputs_with_metric,
     require_lyapunov,
-    require_output_metric,
+    require_output_metrics,
 )
 from sfkd_jax.certification._metrics import propose_metric, prove_lyapunov
 from sfkd_jax.certification._search import prove_claims
@@ -74,7 +73,7 @@ def prove(
     box = require_box("env_box", env_box)
     weights = exported(model, params)
     larger = with_room(weights)
-    claims = prove_claims(larger)
+    claims = prove_claims(larger, model.frame)
     require(
         claims.alpha <= 1.0 - MARGIN,  # refuses NaN as well
         f"alpha = {claims.alpha:.6f} (rho {claims.rho:.6f}, beta {claims.beta:.6f}) "
@@ -86,8 +85,7 @@ def prove(
     outputs = {}
     if validation is not None:
         lyapunov, refused = _lyapunov(larger)
-        if not model.frame.has_pose and keeps_metrics(larger):
-            outputs = _metrics_of_outputs(model, params, larger, lyapunov, validation)
+        outputs = _metrics_of_outputs(model, params, larger, lyapunov, validation)
     return Proof(
         **vars(claims),
         transport_lipschitz=1.0,
@@ -122,16 +120,20 @@ def _metrics_of_outputs(
     lyapunov: LyapunovClaim | None,
     validation: Trajectory,
 ) -> dict[str, OutputMetric]:
-    """Return a metric for each of `OUTPUTS`.
+    """Return a metric for each output that may have one.
 
-    There is none if there is no metric for one of them, because a corridor needs all.
+    There is none if there is no metric for one of them: a proof is about all outputs,
+    or says that it is about none.
     """
+    names = outputs_with_metric(weights, model.frame)
+    if not names:
+        return {}
+    rows = readouts(weights, model.frame)
     gaps = worst_gaps(residuals(model, fold(model, params, on_host), validation))
     start = None if lyapunov is None else np.asarray(lyapunov.metric)
     try:
         return {
-            name: propose_metric(weights, readouts(weights)[name], gaps, start)
-            for name in OUTPUTS
+            name: propose_metric(weights, rows[name], gaps, start) for name in names
         }
     except CertificationRefused:
         return {}
@@ -163,7 +165,7 @@ def verify_proof(
         raise CertificateStale("the certificate is about other weights")
     weights = exported(model, params) if weights is None else weights
     with well_formed(), one_thread():
-        require_claims(proof, weights)
+        require_claims(proof, weights, model.frame)
         require_box("env_box", proof.env_box)
         require(
             proof.alpha < 1.0 and proof.transport_lipschitz == 1.0,
@@ -173,8 +175,7 @@ def verify_proof(
         require(proof.precision == PRECISION, "precision is not what is covered")
         _require_attacks(proof, weights)
         require_lyapunov(proof, weights)
-        for name, claim in proof.outputs.items():
-            require_output_metric(name, claim, weights)
+        require_output_metrics(proof.outputs, weights, model.frame)
 
 
 def _require_attacks(proof: Proof, weights: Exported) -> None:

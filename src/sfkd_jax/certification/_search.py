@@ -24,6 +24,7 @@ from sfkd_jax.certification._core import (
     witness_matrix,
 )
 from sfkd_jax.certification._weights import Exported, one_thread, require
+from sfkd_jax.types import Frame
 
 SCALES = np.geomspace(0.25, 4.0, 33)
 """Common factors of the multipliers that are tried."""
@@ -38,8 +39,12 @@ INFEASIBLE = 1e3
 
 
 @one_thread()
-def prove_claims(weights: Exported) -> Claims:
+def prove_claims(weights: Exported, frame: Frame) -> Claims:
     """Search for the smallest constants that the core accepts.
+
+    Args:
+        weights: of the model.
+        frame: of the model.
 
     Raises:
         CertificationRefused: no bound of the residual or of the decoder is proved.
@@ -54,7 +59,7 @@ def prove_claims(weights: Exported) -> Claims:
     alpha_joint, joint_multipliers = joint_bound(weights, multipliers)
     lipschitz = {
         name: COMPILATION_SLACK * norm_upper(matrix)
-        for name, matrix in readouts(weights).items()
+        for name, matrix in readouts(weights, frame).items()
     }
     of_decoders = {}
     for name, network in decoders(weights).items():

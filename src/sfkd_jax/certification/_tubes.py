@@ -14,10 +14,7 @@ from jaxtyping import Float
 from sfkd_jax.certificate import OutputBound, OutputMetric, OutputTube, StepErrors, Tube
 from sfkd_jax.certification._claims import rows
 from sfkd_jax.certification._measured import Residuals, conformal_quantile, coverage_of
-from sfkd_jax.certification._metric_claims import OUTPUTS
-
-RADII = {"position_m": "position", "yaw_rad": "yaw", "body": "body"}
-"""Names of radii in a document, and of the outputs whose errors they bound."""
+from sfkd_jax.types import Frame
 
 
 def latent_tube(
@@ -47,6 +44,7 @@ def tubes(
     *,
     alpha: float,
     lipschitz: Mapping[str, float],
+    frame: Frame,
     one_step: StepErrors,
     horizon: int,
     largest_increment: float | None,
@@ -66,31 +64,34 @@ def tubes(
 
     Args:
         alpha: contraction factor α.
-        lipschitz: L of the outputs, by "position", "yaw", "body".
+        lipschitz: L of the outputs, by name.
+        frame: whose outputs they are.
         one_step: measured bounds at the true latent: d̄, and ε of the outputs.
         horizon: T [steps].
         largest_increment: |dp|, the longest step [m]; None without a pose.
     """
-    latent = latent_tube(alpha, one_step.latent, horizon)
+    latent = latent_tube(alpha, one_step["latent"], horizon)
     # R_k → d̄ / (1 − α), the fixed point of R ↦ α R + d̄.
-    ultimate = one_step.latent / (1 - alpha)
+    ultimate = one_step["latent"] / (1 - alpha)
     # R_0 … R_{T−1}, and the limit. R_0 = 0: a prediction starts at the observed state.
     before = np.concatenate([[0.0], latent[:-1], [ultimate]])
+    labels = frame.labels
     radii = {
-        name: lipschitz[output] * alpha * before + getattr(one_step, output)
-        for name, output in RADII.items()
+        labels[output]: lipschitz[output] * alpha * before + one_step[output]
+        for output in frame.outputs
     }
     limits = None
     if largest_increment is None:
         limits = {name: float(radius[-1]) for name, radius in radii.items()}
     else:
         # Errors of increments add up, so that the pose has no limit.
-        yaw = np.cumsum(lipschitz["yaw"] * before + one_step.yaw)
+        yaw = np.cumsum(lipschitz["yaw"] * before + one_step["yaw"])
         # An error of yaw moves only the increments that come after it.
         yaw_before = np.concatenate([[0.0], yaw[:-1]])
-        increments = lipschitz["position"] * before + one_step.position
-        radii["position_m"] = np.cumsum(increments + largest_increment * yaw_before)
-        radii["yaw_rad"] = yaw
+        increments = lipschitz["position"] * before + one_step["position"]
+        position = np.cumsum(increments + largest_increment * yaw_before)
+        radii[labels["position"]] = position
+        radii[labels["yaw"]] = yaw
     return Tube(
         latent=rows(latent),
         physical={name: rows(radius[:-1]) for name, radius in radii.items()},
@@ -129,7 +130,7 @@ def radii(
     # |d|_P is the 2-norm of d'L with P = L L'.
     factor = np.linalg.cholesky(np.asarray(claim.metric))
     disturbances = np.linalg.norm(measured.gaps @ factor, axis=-1)
-    errors = measured.outputs[..., OUTPUTS.index(name)]
+    errors = measured.outputs[name]
     if start is None:
         initial = np.zeros(len(disturbances))
     else:

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sfkd_jax.certificate import Certificate
+from sfkd_jax.certificate import Certificate, StepErrors
 from sfkd_jax.certification._proving import verify_proof
 from sfkd_jax.certification._tubes import tubes
 from sfkd_jax.certification._weights import (
@@ -20,6 +20,7 @@ from sfkd_jax.certification._weights import (
     require,
     well_formed,
 )
+from sfkd_jax.types import Frame
 
 Trained: TypeAlias = Any
 """A `policy.TrainedModel`: what a certificate is about."""
@@ -61,17 +62,19 @@ def _require_what_follows(certificate: Certificate, trained: Trained) -> None:
     """Refuse an entry that does not follow from the policy and other entries."""
     proof = certificate.proof
     measured = certificate.measured
+    frame = trained.model.frame
+    _require_step_errors(measured.d_bar.one_step, frame)
     stated = measured.tube
     derived = tubes(
         alpha=proof.alpha,
         lipschitz=proof.lipschitz,
+        frame=frame,
         one_step=measured.d_bar.one_step,
         horizon=len(stated.latent),
         largest_increment=stated.largest_increment_m,
     )
-    has_pose = trained.model.frame.has_pose
     require(
-        (stated.largest_increment_m is not None) == has_pose
+        (stated.largest_increment_m is not None) == frame.has_pose
         and near(vars(stated), vars(derived), REPEATED),
         "measured.tube does not follow from the proof and d_bar",
     )
@@ -85,6 +88,18 @@ def _require_what_follows(certificate: Certificate, trained: Trained) -> None:
     require(
         measured.boxes.env == proof.env_box, "measured.boxes.env is not proof.env_box"
     )
+
+
+def _require_step_errors(stated: StepErrors, frame: Frame) -> None:
+    """Refuse bounds of other errors than those of the latent and of the outputs."""
+    where = "measured.d_bar.one_step"
+    expected = ("latent", *frame.outputs)
+    for name in expected:
+        require(name in stated, f"{where}.{name} is missing")
+    for name in stated:
+        require(
+            name in expected, f"{where}.{name!a:.80} is not an entry of a certificate"
+        )
 
 
 def _require_sizes(certificate: Certificate, trained: Trained) -> None:

@@ -17,6 +17,8 @@ ACTIVATIONS = ("tanh", "relu", "sigmoid", "softplus", "elu")
 """Activations with slopes in [0, 1] everywhere, which excludes gelu and silu."""
 TRANSPORTS = ("identity", "rotation")
 """Kinds of transport that do not enlarge distances of latent states."""
+RESERVED = ("latent", "residual_slopes", "transport", "step", "step_slopes")
+"""Names of errors and attacks that are not about an output; no output may have them."""
 MALFORMED = (
     LookupError,
     TypeError,
@@ -93,8 +95,8 @@ def exported(model: Model, params: Params) -> Exported:
     explicit = model.structure.explicit
     if explicit is None:
         raise CertificationRefused("this model exposes no explicit weights to certify")
-    _require_outputs(model.frame)
     weights = on_host(explicit, fold(model, params, on_host))
+    _require_outputs(model.frame, weights)
     # Every float32 number is a float64 number, so that nothing is rounded here.
     weights = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=np.float64), weights)
     finite = all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(weights))
@@ -118,22 +120,45 @@ def exported(model: Model, params: Params) -> Exported:
     return weights
 
 
-def _require_outputs(frame: Frame) -> None:
-    """Refuse a frame with other outputs than those that the claims are about."""
-    stated = BODY_FRAME.outputs
-    if not frame.has_pose:
-        first = BODY.start
-        stated = {
-            "position": slice(first, first + 1),
-            "yaw": slice(first + 1, first + 2),
-            "body": slice(first + 2, None),
-        }
-    # Claims go by the order of the outputs, so it has to be the same as well.
+def _require_outputs(frame: Frame, weights: Exported) -> None:
+    """Refuse a frame with outputs that no claim can be about.
+
+    Args:
+        frame: of the model.
+        weights: of the model.
+    """
+    where = f"the frame {frame.name!r}"
     require(
-        list(frame.outputs.items()) == list(stated.items()),
-        f"a certificate bounds the outputs {stated} of a state, in this order; the "
-        f"frame {frame.name!r} states {dict(frame.outputs)}",
+        bool(weights.decoder) == frame.has_pose,
+        f"{where} must have a pose exactly if the model has a decoder",
     )
+    if frame.has_pose:
+        # A decoder gives the position and the yaw, in this order.
+        stated = BODY_FRAME.outputs
+        require(
+            list(frame.outputs.items()) == list(stated.items()),
+            f"a certificate bounds the outputs {stated} of a state with a pose, in "
+            f"this order; {where} states {dict(frame.outputs)}",
+        )
+        return
+    require(frame.outputs, f"{where} states no outputs")
+    size = BODY.start + len(weights.readout)
+    for name in frame.outputs:
+        require(
+            name not in RESERVED,
+            f"{where} states the output {name!r}, a name that has another meaning in "
+            "a certificate",
+        )
+        try:
+            entries = np.arange(size)[frame.entries(name)]
+        except IndexError:
+            entries = np.zeros(0)
+        # The entries of the pose are always 0 in this frame.
+        require(
+            len(entries) and np.min(entries) >= BODY.start,
+            f"{where} states the output {name!r} = {frame.outputs[name]}, which must "
+            f"be entries {BODY.start} to {size - 1} of a state",
+        )
 
 
 def fingerprint(params: Params) -> str:

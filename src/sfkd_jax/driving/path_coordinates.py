@@ -60,10 +60,12 @@ PATH_FRAME = Frame(
     name="path",
     has_pose=False,
     outputs={"position": slice(3, 4), "yaw": slice(4, 5), "body": slice(5, None)},
+    units={"position": "m", "yaw": "rad", "body": ""},
     angles=(4,),
     # Body rates and steering move the car along a path only in later steps.
     lengths=(1.0, 1.0, 5.0, 1.0, 5.0),
     length=0.05,
+    distances=(0, 1, 3),
     inputs=2,
     following=_at_reference_speed,
 )

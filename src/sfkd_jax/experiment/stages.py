@@ -178,7 +178,7 @@ def _verdict(
     d_bar = certificate.measured.d_bar
     signature = "signed" if settings.signing_key else "unsigned"
     holds = f"holds for {d_bar.holds_for} (measured, {signature})"
-    return f"{verdict}; d_bar {d_bar.one_step.latent:.4g} {holds}"
+    return f"{verdict}; d_bar {d_bar.one_step['latent']:.4g} {holds}"
 
 
 def _recorded_certification(run: Run) -> dict[str, Any]:

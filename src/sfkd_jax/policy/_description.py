@@ -120,7 +120,7 @@ def _certified_facts(
     """Yield the lines about what is proved and what is only measured."""
     alpha = certificate.proof.alpha
     yield f"proved: alpha {alpha:.4f}, contraction of the model a step"
-    d_bar = certificate.measured.d_bar.one_step.latent
+    d_bar = certificate.measured.d_bar.one_step["latent"]
     measured = f"measured, {signature}: d_bar {d_bar:.3g}"
     corridor = certificate.corridor
     if corridor is None:

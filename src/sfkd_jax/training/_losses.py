@@ -53,21 +53,31 @@ def error_units(
 ) -> Float[Array, " state"]:
     """Return factors that convert each of `state_errors` to metres.
 
-    See `Frame.lengths` and `Frame.length`, which are for a system of size 1. A distance
-    counts relative to the size of the system, and other errors as they are.
+    See `Frame.lengths` and `Frame.length`, which are for a system of size 1. The
+    entries in `Frame.distances` count relative to the size of the system, and other
+    errors as they are.
 
     Args:
         model: in whose frame the errors are.
         space: scales of the model.
         size: of the system.
+
+    Raises:
+        ValueError: the frame states lengths of more entries than a state has.
     """
     frame = model.frame
-    # Distances come before and after the yaw of the pose.
-    distances = [1.0 / size, 1.0 / size, 1.0]
-    if not frame.has_pose:
-        distances = [*distances, 1.0 / size, 1.0]
-    first = jnp.asarray(frame.lengths) * jnp.asarray(distances)
+    scales = [
+        1.0 / size if entry in frame.distances else 1.0
+        for entry in range(len(frame.lengths))
+    ]
+    first = jnp.asarray(frame.lengths) * jnp.asarray(scales)
     units = frame.length / jnp.asarray(space.body_scale)
+    entries = BODY.start + len(units)
+    if len(first) > entries:
+        raise ValueError(
+            f"the frame {frame.name!r} states lengths of {len(first)} entries, and a "
+            f"state has {entries}"
+        )
     return jnp.concatenate([first, units[len(first) - BODY.start :]])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sfkd_jax.certificate import OutputMetric
-from sfkd_jax.certification import FORMS, OUTPUTS, radii, residuals
+from sfkd_jax.certification import FORMS, radii, residuals
 from sfkd_jax.driving.certificate import Seen
 from sfkd_jax.driving.corridor._alarms import simulate_nominal
 from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
@@ -23,6 +23,8 @@ from sfkd_jax.types import BODY, Key, Trajectory
 
 ROAD_SETTINGS = DriveClass._fields
 """Settings of the data set that say which class its drives are of."""
+OUTPUTS = ("position", "yaw")
+"""Outputs whose distances to the nominal model a corridor bounds: e_y and e_ψ."""
 EXCITATION = ("steering_excitation", "speed_excitation")
 """Settings of the data set that say how ν is drawn."""
 Driver: TypeAlias = Callable[[Key], tuple[Trajectory, Reading | None]]
