@@ -14,6 +14,7 @@ from helpers import (
     jit,
     model_and_params,
     path_space,
+    space,
 )
 
 import sfkd_jax
@@ -26,7 +27,7 @@ from sfkd_jax.certification import (
 )
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
-from sfkd_jax.types import Samples
+from sfkd_jax.types import BODY_FRAME, Samples
 
 BOX = (ENV_LOW, ENV_HIGH)
 
@@ -60,23 +61,55 @@ def test_evidence_on_a_grid_is_refused_by_name():
         prove(declaring(model, operators=operators), params, BOX)
 
 
+def in_frame(frame, outputs):
+    """Export a tiny model in such a frame, with other outputs."""
+    spaces = {PATH_FRAME: path_space(), BODY_FRAME: space()}
+    model = models.sfkd(spaces[frame], **TINY, frame=frame)
+    other = dataclasses.replace(
+        frame, name="mine", outputs=outputs, units=dict.fromkeys(outputs, "m")
+    )
+    exported(model._replace(frame=other), model.init(jax.random.key(0)))
+
+
 @pytest.mark.parametrize(
     "outputs",
     [
-        {"position": slice(3, 5), "yaw": slice(5, 6), "body": slice(6, None)},
-        {"yaw": slice(4, 5), "position": slice(3, 4), "body": slice(5, None)},
-        {"position": slice(3, 4), "roll": slice(4, 5), "body": slice(5, None)},
-        {"position": slice(3, 4)},
+        {"position": slice(0, 2), "yaw": slice(2, 3)},
+        {"yaw": slice(2, 3), "position": slice(0, 2), "body": slice(3, None)},
+        {"position": slice(0, 2), "roll": slice(2, 3), "body": slice(3, None)},
     ],
 )
-def test_outputs_that_the_claims_are_not_about_are_refused(outputs):
-    """Claims are about rows of the read-out; they would be given wrong names."""
-    model = models.sfkd(path_space(), **TINY, frame=PATH_FRAME)
-    other = dataclasses.replace(PATH_FRAME, name="mine", outputs=outputs)
-    params = model.init(jax.random.key(0))
-    exported(model, params)
+def test_with_a_pose_the_outputs_are_those_of_its_decoder(outputs):
+    in_frame(BODY_FRAME, BODY_FRAME.outputs)
     with pytest.raises(CertificationRefused, match="the frame 'mine' states"):
-        exported(model._replace(frame=other), params)
+        in_frame(BODY_FRAME, outputs)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reason"),
+    [
+        ({}, "states no outputs"),
+        ({"height": (6,)}, "must be entries 3 to 5 of a state"),
+        ({"height": (-7,)}, "must be entries 3 to 5 of a state"),
+        ({"height": (2, 3)}, "must be entries 3 to 5 of a state"),
+        ({"height": ()}, "must be entries 3 to 5 of a state"),
+        ({"height": slice(6, None)}, "must be entries 3 to 5 of a state"),
+        ({"latent": (3,)}, "'latent', a name that has another meaning"),
+        ({"step": (3,)}, "'step', a name that has another meaning"),
+    ],
+)
+def test_without_a_pose_the_outputs_are_entries_that_a_state_has(outputs, reason):
+    in_frame(PATH_FRAME, {"height": (5,), "swing": (3, 4)})
+    with pytest.raises(CertificationRefused) as refused:
+        in_frame(PATH_FRAME, outputs)
+    assert "the frame 'mine' states" in str(refused.value)
+    assert reason in str(refused.value)
+
+
+def test_a_decoder_of_the_pose_belongs_to_a_frame_with_one():
+    model, params = model_and_params("sfkd")
+    with pytest.raises(CertificationRefused, match="a pose exactly if"):
+        exported(model._replace(frame=PATH_FRAME), params)
 
 
 def test_a_transport_that_stretches_is_found_out():

@@ -1,6 +1,7 @@
 """The loss decreases; a run survives a kill, is reproducible, and stops at NaN."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 from helpers import TINY, VARIANTS, dataset, jit, largest_file, path_space
 
 from sfkd_jax.data import measure_space, random_windows, spread_windows
+from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.models import sfkd
 from sfkd_jax.training import (
     Checkpoints,
@@ -19,7 +21,8 @@ from sfkd_jax.training import (
     multi_step_loss,
     planning_loss,
 )
-from sfkd_jax.types import Trajectory
+from sfkd_jax.training._losses import error_units
+from sfkd_jax.types import BODY_FRAME, Trajectory
 
 OPTIONS = {"steps": 40, "log_every": 10, "save_every": 20}
 DRAW = partial(random_windows, batch=16, length=8)
@@ -134,6 +137,26 @@ def test_a_directory_holds_one_training_and_says_so(task, unbroken, capfd):
         with pytest.raises(ValueError, match=f"holds another training .*{message}"):
             train(changed, directory, **options)
     assert capfd.readouterr().err == ""
+
+
+def test_an_error_counts_by_the_lengths_and_distances_of_its_frame():
+    """In a system of half the size a distance counts twice; half a width is as before."""
+    model = sfkd(path_space(), **TINY, frame=PATH_FRAME)
+    half = path_space().body_scale
+
+    def units_in(frame, size):
+        return error_units(model._replace(frame=frame), path_space(), size)
+
+    expected = jnp.asarray([2.0, 2.0, 5.0, 2.0, 5.0, 0.05 / half[2]])
+    np.testing.assert_allclose(units_in(PATH_FRAME, 0.5), expected, rtol=1e-6)
+    expected = jnp.asarray([2.0, 2.0, 5.0, *(0.2 / half)])
+    np.testing.assert_allclose(units_in(BODY_FRAME, 0.5), expected, rtol=1e-6)
+    other = replace(PATH_FRAME, lengths=(0.0, 0.0, 0.0, 3.0), distances=(3,))
+    expected = jnp.asarray([0.0, 0.0, 0.0, 6.0, *(0.05 / half[1:])])
+    np.testing.assert_allclose(units_in(other, 0.5), expected, rtol=1e-6)
+    longer = replace(PATH_FRAME, lengths=(1.0,) * 7)
+    with pytest.raises(ValueError, match="lengths of 7 entries, and a state has 6"):
+        units_in(longer, 1.0)
 
 
 def test_what_planners_add_is_what_the_model_lacks():
