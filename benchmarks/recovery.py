@@ -32,6 +32,7 @@ from sfkd_jax.driving.paths import (
 from sfkd_jax.driving.simulation.metrics import room_in_lane
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.info import ControllerInfo, PlanInfo
+from sfkd_jax.schedules import random_switching
 from sfkd_jax.types import Controller
 
 SPACING = 0.5
@@ -546,7 +547,7 @@ def in_class(car, many, seed=6):
     ]
     low, high = about.env_box
     box = {"low": low, "high": high, "dwell": about.dwell_s}
-    switching = partial(scenarios.random_switching, **length, **box)
+    switching = partial(random_switching, **length, **box)
     road = roads(many, seed, switching, np.stack(bends))
     return runs_on(car, road, LONGEST, seed, speed=speeds)
 

@@ -3,6 +3,10 @@
 from sfkd_jax.control._factory import Stateful as Stateful
 from sfkd_jax.control._factory import factory as factory
 from sfkd_jax.control._finite import all_finite as all_finite
+from sfkd_jax.control._safety_filter import FILTER_SCALES as FILTER_SCALES
+from sfkd_jax.control._safety_filter import FilterResult as FilterResult
+from sfkd_jax.control._safety_filter import safety_filter as safety_filter
+from sfkd_jax.control._safety_filter import size_of as size_of
 from sfkd_jax.control._task import Limiter as Limiter
 from sfkd_jax.control._task import PlanningStart as PlanningStart
 from sfkd_jax.control._task import RolloutSetup as RolloutSetup

@@ -13,6 +13,7 @@ from helpers import any_law, jit, tiny
 import sfkd_jax
 from sfkd_jax import assembly
 from sfkd_jax.certificate import Boxes, read
+from sfkd_jax.control import FILTER_SCALES
 from sfkd_jax.driving import path_following, paths, scenarios
 from sfkd_jax.driving.certificate import (
     DrivingCertificate,
@@ -22,7 +23,7 @@ from sfkd_jax.driving.certificate import (
     RecordedConditions,
 )
 from sfkd_jax.driving.path_coordinates import PATH_FRAME, vehicle_state
-from sfkd_jax.driving.path_following import Conditions, along_reference, safety_filter
+from sfkd_jax.driving.path_following import Conditions, along_reference, corridor_filter
 from sfkd_jax.driving.plants import kinematic
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
@@ -240,7 +241,7 @@ def margin_of(xi, nu, road):
 ROAD = np.asarray([0.002, SPEED])
 filter_from = jit(
     partial(
-        safety_filter,
+        corridor_filter,
         TOY,
         ENV,
         preview=jnp.tile(jnp.asarray(ROAD), (HORIZON, 1)),
@@ -262,7 +263,7 @@ def test_the_largest_scale_that_keeps_the_nominal_model_inside_is_chosen():
     for _ in range(100):
         edge, heading = random.uniform(0.6, 1.0) * WIDTH, random.uniform(-0.02, 0.02)
         xi, nu = np.asarray([edge, heading, SPEED]), random.uniform(-1, 1, 2) * LIMIT
-        shares = path_following.FILTER_SCALES
+        shares = FILTER_SCALES
         margins = np.asarray([margin_of(xi, share * nu, ROAD) for share in shares])
         if np.min(np.abs(margins)) < 1e-5 or np.max(margins) < 0:
             continue

@@ -18,7 +18,8 @@ from sfkd_jax.driving.corridor._alarms import simulate_nominal
 from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
 from sfkd_jax.driving.drives import Reading, drive_along_path, from_s3
 from sfkd_jax.driving.path_coordinates import LATERAL
-from sfkd_jax.driving.scenarios import DRIVES, DriveClass, random_switching
+from sfkd_jax.driving.scenarios import DRIVES, DriveClass
+from sfkd_jax.schedules import random_switching
 from sfkd_jax.types import BODY, Key, Trajectory
 
 ROAD_SETTINGS = DriveClass._fields

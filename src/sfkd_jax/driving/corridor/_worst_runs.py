@@ -22,7 +22,7 @@ from sfkd_jax.driving.path_coordinates import (
     PERTURBATION,
     REFERENCE_SPEED,
 )
-from sfkd_jax.driving.path_following import safety_filter
+from sfkd_jax.driving.path_following import corridor_filter
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.types import BODY, Control, Environment, Key, Params
 
@@ -267,7 +267,7 @@ def attack_corridor(
         roads = inputs[jnp.minimum(ahead, LENGTH - 1), PERTURBATION.stop :]
 
         def admissible(fiber: Any, latent: Any, wanted: Control, index: Any) -> Control:
-            filtered = safety_filter(
+            filtered = corridor_filter(
                 loop.model,
                 fiber,
                 latent,

@@ -14,11 +14,11 @@ from sfkd_jax.driving.scenarios import (
     BOX,
     held_road,
     in_box,
-    random_switching,
     switching_road,
     uniform_road,
     wet_road,
 )
+from sfkd_jax.schedules import random_switching
 from sfkd_jax.types import Key
 
 Conditions: TypeAlias = Callable[[Key], Float[Array, "time environment"]]

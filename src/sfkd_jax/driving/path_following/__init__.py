@@ -65,6 +65,9 @@ from sfkd_jax.driving.path_following.wrappers._conditions import Box as Box
 from sfkd_jax.driving.path_following.wrappers._conditions import (
     Conditions as Conditions,
 )
+from sfkd_jax.driving.path_following.wrappers._corridor_filter import (
+    corridor_filter as corridor_filter,
+)
 from sfkd_jax.driving.path_following.wrappers._delays import (
     DelayEstimator as DelayEstimator,
 )
@@ -98,11 +101,5 @@ from sfkd_jax.driving.path_following.wrappers._prediction import (
 from sfkd_jax.driving.path_following.wrappers._prediction import Predictor as Predictor
 from sfkd_jax.driving.path_following.wrappers._prediction import (
     periods_ahead as periods_ahead,
-)
-from sfkd_jax.driving.path_following.wrappers._safety_filter import (
-    FILTER_SCALES as FILTER_SCALES,
-)
-from sfkd_jax.driving.path_following.wrappers._safety_filter import (
-    safety_filter as safety_filter,
 )
 from sfkd_jax.driving.path_following.wrappers._shield import Shield as Shield

@@ -20,12 +20,7 @@ from sfkd_jax.driving.plants._own import simulator as simulator
 from sfkd_jax.driving.plants._variables import FRICTION as FRICTION
 from sfkd_jax.driving.plants._variables import KNOWN_STATES as KNOWN_STATES
 from sfkd_jax.driving.plants._variables import MASS as MASS
-from sfkd_jax.driving.plants._variables import ControlVariable as ControlVariable
-from sfkd_jax.driving.plants._variables import (
-    EnvironmentVariable as EnvironmentVariable,
-)
 from sfkd_jax.driving.plants._variables import Size as Size
-from sfkd_jax.driving.plants._variables import StateVariable as StateVariable
 from sfkd_jax.driving.plants._variables import roles_of as roles_of
 from sfkd_jax.driving.plants._vehicle import Vehicle as Vehicle
 from sfkd_jax.driving.plants._vehicle import equivalent_wind as equivalent_wind

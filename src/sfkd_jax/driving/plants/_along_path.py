@@ -13,10 +13,18 @@ from sfkd_jax.driving.path_coordinates import (
     PathFeedback,
     path_step,
 )
-from sfkd_jax.driving.plants._variables import ControlVariable, StateVariable
 from sfkd_jax.driving.plants._vehicle import SPEED_RANGE, Vehicle
 from sfkd_jax.geometry import without_pose
-from sfkd_jax.types import BODY, Control, Environment, Scalar, State, Step
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    ControlVariable,
+    Environment,
+    Scalar,
+    State,
+    StateVariable,
+    Step,
+)
 
 LARGEST_CURVATURE = 0.2
 """Limit of the curvature of a path [1/m]; no car can turn as tightly."""

@@ -5,68 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-
-class StateVariable(NamedTuple):
-    """A state of a vehicle.
-
-    Attributes:
-        name: as in `KNOWN_STATES`, or any other.
-        unit: of the state; "" if it is not known.
-        deviation: standard deviation of its sensor, in that unit. 0 stands for an exact
-            observation, and is the value of a state without a stated deviation.
-    """
-
-    name: str
-    unit: str = ""
-    deviation: float = 0.0
-
-    @property
-    def label(self) -> str:
-        """Name and unit, as in "v [m/s]"."""
-        return _labelled(self.name, self.unit)
-
-    @property
-    def is_angle(self) -> bool:
-        """Whether it is an angle [rad]."""
-        return self.unit == "rad"
-
-
-class ControlVariable(NamedTuple):
-    """A control of a vehicle.
-
-    Attributes:
-        name: of the control.
-        unit: of the control.
-        low: lower limit of the actuator; None if it is unknown.
-        high: upper limit of the actuator; None if it is unknown.
-    """
-
-    name: str
-    unit: str
-    low: float | None = None
-    high: float | None = None
-
-    @property
-    def label(self) -> str:
-        """Name and unit, as in "steering [rad]"."""
-        return _labelled(self.name, self.unit)
-
-
-class EnvironmentVariable(NamedTuple):
-    """An entry of e.
-
-    Attributes:
-        name: of the entry.
-        unit: of the entry; "-" if it has none.
-    """
-
-    name: str
-    unit: str
-
-    @property
-    def label(self) -> str:
-        """Name and unit, as in "friction [-]"."""
-        return _labelled(self.name, self.unit)
+from sfkd_jax.types import ControlVariable, EnvironmentVariable, StateVariable
 
 
 class Size(NamedTuple):
@@ -163,7 +102,3 @@ def roles_of(names: Sequence[str], stated: Sequence[str] = ()) -> tuple[str, ...
 def states_of(names: Iterable[str]) -> tuple[StateVariable, ...]:
     """Return the states of these names; an unknown state has nothing but its name."""
     return tuple(KNOWN_STATES.get(name, StateVariable(name)) for name in names)
-
-
-def _labelled(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name

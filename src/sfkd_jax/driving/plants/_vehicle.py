@@ -13,13 +13,20 @@ from sfkd_jax.driving.plants._variables import (
     CAR_SIZE,
     FRICTION_AND_WIND,
     STEERING,
-    ControlVariable,
-    EnvironmentVariable,
     Size,
-    StateVariable,
 )
 from sfkd_jax.rollout import runge_kutta
-from sfkd_jax.types import GRAVITY, Control, Environment, Scalar, State, Step
+from sfkd_jax.types import (
+    GRAVITY,
+    Control,
+    ControlVariable,
+    Environment,
+    EnvironmentVariable,
+    Scalar,
+    State,
+    StateVariable,
+    Step,
+)
 
 CAR_CONTROLS = (
     STEERING._replace(low=-0.5, high=0.5),

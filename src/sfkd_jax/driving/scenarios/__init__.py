@@ -7,7 +7,6 @@ from sfkd_jax.driving.scenarios._conditions import in_box as in_box
 from sfkd_jax.driving.scenarios._conditions import (
     random_side_forces as random_side_forces,
 )
-from sfkd_jax.driving.scenarios._conditions import random_switching as random_switching
 from sfkd_jax.driving.scenarios._conditions import switching_road as switching_road
 from sfkd_jax.driving.scenarios._conditions import uniform_road as uniform_road
 from sfkd_jax.driving.scenarios._conditions import wet_road as wet_road

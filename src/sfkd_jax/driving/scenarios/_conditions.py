@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.types import Environment, Key, Scalar
+from sfkd_jax.schedules import Corner, Range, from_box, within
+from sfkd_jax.types import Key, Scalar
 
-Range = tuple[float, float]
-Corner = tuple[float, ...] | Environment
 Schedule = Float[Array, "time 2"]
 """Friction [-] and side wind [m/s] over time."""
 
@@ -175,51 +172,4 @@ def held_road(
         low: lower corner of E, in units of e.
         high: upper corner of E.
     """
-    return jnp.tile(_from_box(key, low, high), (steps, 1))
-
-
-def random_switching(
-    key: Key,
-    *,
-    steps: int,
-    dt: float,
-    low: Corner,
-    high: Corner,
-    dwell: Range = (3.0, 6.0),
-) -> Float[Array, "time environment"]:
-    """Draw environments from the box E as `held_road` does, each held for some time.
-
-    Args:
-        key: consumed.
-        steps: number of time steps.
-        dt: sampling period [s].
-        low: lower corner of E, (environment,), in units of e.
-        high: upper corner of E.
-        dwell: range of the time between two switches [s].
-    """
-    level_key, hold_key = jax.random.split(key)
-    # Enough even if every environment is held for the shortest time.
-    count = int(steps * dt / dwell[0]) + 2
-    from_box = partial(_from_box, low=low, high=high)
-    levels = jax.vmap(from_box)(jax.random.split(level_key, count))
-    ends = jnp.cumsum(within(dwell, hold_key, count))
-    return levels[jnp.searchsorted(ends, jnp.arange(steps) * dt, side="right")]
-
-
-def within(
-    bounds: tuple[float | Scalar, float | Scalar], key: Key, *shape: int
-) -> Float[Array, "*shape"]:
-    """Draw an array of the given shape, uniform in a range."""
-    return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
-
-
-def _from_box(key: Key, low: Corner, high: Corner) -> Float[Array, " environment"]:
-    """Draw a point of a box; each entry is at an end of its range with probability 1/3.
-
-    The ends are drawn so often because models are worst there.
-    """
-    # A sixth of the wider range lies beyond each end, and is clipped to it.
-    share = jnp.clip(within((-0.25, 1.25), key, len(low)), 0.0, 1.0)
-    bottom = jnp.asarray(low)
-    top = jnp.asarray(high)
-    return bottom + share * (top - bottom)
+    return jnp.tile(from_box(key, low, high), (steps, 1))

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sfkd_jax.driving.scenarios._conditions import within
 from sfkd_jax.ranges import Positive, Span
+from sfkd_jax.schedules import within
 from sfkd_jax.types import Key, Scalar
 
 DRIVES = ("bends", "speeds", "lane_changes")

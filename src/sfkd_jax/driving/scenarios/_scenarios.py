@@ -19,9 +19,9 @@ from sfkd_jax.driving.scenarios._conditions import (
     switching_road,
     uniform_road,
     wet_road,
-    within,
 )
 from sfkd_jax.ranges import Positive, Span
+from sfkd_jax.schedules import within
 from sfkd_jax.types import Key, Scalar, State
 
 RUN_UP = 20.0

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import product
-from math import prod
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sfkd_jax.driving.path_coordinates import PATH_SPEED, PathState
 from sfkd_jax.driving.path_following.laws._steady_turn import SteadyTurn
 from sfkd_jax.geometry import put
 from sfkd_jax.ranges import Positive
+from sfkd_jax.tables import corners, interpolated
 from sfkd_jax.types import Control, Environment, Scalar
 
 TEXTBOOK = {
@@ -65,15 +63,12 @@ class PathLaw(NamedTuple):
         counts = self.control.shape[:-1]
         # The limit of the tyres has the same v² κ at every speed of the table.
         at = jnp.concatenate([jnp.stack([curvature * speed**2, speed]), env])
-        rows, weights = _corners(at, self.low, self.high, counts)
+        rows, weights = corners(at, self.low, self.high, counts)
 
-        def interpolate(table: Array) -> Array:
-            points = table.reshape(-1, *table.shape[len(at) :])
-            return jnp.tensordot(weights, points[rows], 1)
-
-        state = interpolate(self.state)
-        control = interpolate(self.control)
-        gain = interpolate(self.gain)
+        axes = len(at)
+        state = interpolated(self.state, rows, weights, axes)
+        control = interpolated(self.control, rows, weights, axes)
+        gain = interpolated(self.gain, rows, weights, axes)
         # Below the speeds of the table less drive keeps the speed, and at rest none
         # does.
         share = jnp.clip(speed / self.low[1], 0.0, 1.0)
@@ -105,7 +100,7 @@ class PathLaw(NamedTuple):
         """
         counts = self.control.shape[1:-1]
         table = self.control[turns, ..., 0]
-        rows, weights = _corners(at, self.low[1:], self.high[1:], counts)
+        rows, weights = corners(at, self.low[1:], self.high[1:], counts)
         return table.reshape(len(table), -1)[:, rows] @ weights
 
     def __call__(
@@ -113,32 +108,6 @@ class PathLaw(NamedTuple):
     ) -> Control:
         """Return u, without any limit."""
         return self.turn(curvature, speed, env).feedback(xi)
-
-
-def _corners(
-    at: Float[Array, " axis"],
-    low: Float[Array, " axis"],
-    high: Float[Array, " axis"],
-    counts: tuple[int, ...],
-) -> tuple[Int[Array, " corner"], Float[Array, " corner"]]:
-    """Return flat indices and weights of grid points for multilinear interpolation.
-
-    Args:
-        at: where to interpolate.
-        low: lower ends of the axes.
-        high: upper ends of the axes.
-        counts: number of grid points on each axis.
-    """
-    last = np.asarray(counts) - 1
-    # Outside the axes the turn at their ends is used, never an extrapolated gain.
-    position = jnp.clip((at - low) / (high - low), 0.0, 1.0) * last
-    # The index is at most that of the last but one point, so it has an upper neighbour.
-    index = jnp.minimum(jnp.floor(position).astype(int), last - 1)
-    beyond = position - index
-    sides = np.asarray(list(product((0, 1), repeat=len(counts))))
-    strides = np.asarray([prod(counts[axis + 1 :]) for axis in range(len(counts))])
-    weights = jnp.prod(jnp.where(sides == 1, beyond, 1.0 - beyond), axis=1)
-    return jnp.sum(index * strides) + sides @ strides, weights
 
 
 def law_from_arrays(arrays: Mapping[str, Any]) -> PathLaw:

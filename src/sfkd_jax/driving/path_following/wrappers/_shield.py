@@ -3,7 +3,7 @@
 Everything that decides whether the planner's control may pass is here. In one control
 step (`Shield.act`) the measurement, which passed the `Gate`, is compared with the
 nominal model (`NominalModel`), the request is scaled down as far as the corridor
-needs (`safety_filter`), and what may be claimed of the step is decided
+needs (`corridor_filter`), and what may be claimed of the step is decided
 (`Shield._claim`).
 """
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.control import Stateful, all_finite
+from sfkd_jax.control import FilterResult, Stateful, all_finite
 from sfkd_jax.driving.path_coordinates import HEADING, PATH_FRAME, PATH_SPEED, PathState
 from sfkd_jax.driving.path_following.laws._feedback import holding
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
@@ -28,16 +28,13 @@ from sfkd_jax.driving.path_following.wrappers._conditions import (
     Conditions,
     check_box,
 )
+from sfkd_jax.driving.path_following.wrappers._corridor_filter import corridor_filter
 from sfkd_jax.driving.path_following.wrappers._nominal import (
     Comparison,
     NominalModel,
     ShieldState,
 )
 from sfkd_jax.driving.path_following.wrappers._rolling import RollingCorridor
-from sfkd_jax.driving.path_following.wrappers._safety_filter import (
-    FilterResult,
-    safety_filter,
-)
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
 from sfkd_jax.types import Control, Controller, Environment, Key, Model, Params, Scalar
@@ -65,15 +62,15 @@ class Decision(NamedTuple):
 class Shield(Stateful):
     """A wrapper around a planner that keeps a nominal model in its corridor.
 
-        ν = u − law(ξ; κ_0, v_0, e),   ν' = safety_filter(ν)
+        ν = u − law(ξ; κ_0, v_0, e),   ν' = corridor_filter(ν)
         u' = clip(law(ξ; κ_0, v_0, e) + ν'),   ẑ⁺ = F(ẑ; (ν', κ_0, v_0), e)
         |ê_y| ≤ width,   |e_y| ≤ width + tube + offset,   offset⁺ = decay · offset
 
     ẑ is the nominal model. It is driven with the inputs of the vehicle and is not
     corrected by measurements. `tube` is a certified bound of |e_y − ê_y|, and
-    `safety_filter` chooses ν'. A control whose request passes unchanged is returned bit
-    for bit. Slew limits of the actuators are not considered. A shield belongs behind a
-    `Gate`, which replaces what is not finite.
+    `corridor_filter` chooses ν'. A control whose request passes unchanged is returned
+    bit for bit. Slew limits of the actuators are not considered. A shield belongs
+    behind a `Gate`, which replaces what is not finite.
 
     - If the planner is not healthy, or its control is not finite, the law drives alone.
     - Outside the conditions (OUTSIDE_BOX) the certificate does not apply, and the law
@@ -264,7 +261,7 @@ class Shield(Stateful):
         request = jnp.where(usable, self._request(planned, law_control), 0.0)
         # Outside the conditions no request is admissible: the law drives alone.
         limit = jnp.where(compared.outside_box, 0.0, self.law.perturbation)
-        passed = safety_filter(
+        passed = corridor_filter(
             self.model,
             compared.fiber,
             now.latent,

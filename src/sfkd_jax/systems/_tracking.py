@@ -1,0 +1,329 @@
+"""Tracking: a system relative to a reference that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.systems._system import Ends, System, check_ends
+from sfkd_jax.types import BODY, Control, Environment, Frame, Key, State
+
+ReferenceState: TypeAlias = Float[Array, " reference"]
+"""The states that the reference has, in the order of the chains."""
+Inputs: TypeAlias = Float[Array, " inputs"]
+"""ρ: the last derivative of each chain, then the states of the reference with a range.
+"""
+Error: TypeAlias = Float[Array, " state"]
+"""ξ: the state less that of the reference, where the reference has it."""
+INVARIANCE = 1e-3
+"""Largest change of a step by what should not matter, relative to the step."""
+
+LENGTH = 0.1
+"""What half the width of an entry of ξ counts in a training loss, in place of metres.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """Coordinates relative to a reference, ξ = x − x_ref, for any system.
+
+    The reference consists of chains: ("x", "vx") says that vx is the rate of x, and its
+    range is that of the rate of vx, which is constant over a sampling period. States in
+    no chain, such as the roll of a quadrotor, stay as they are in ξ. A chain of one
+    state is a set point that moves at a limited rate.
+
+    Attributes:
+        outputs: name -> states; of each output a tube is certified.
+        reference: chain of one or two states -> range of the rate of the last of them.
+        ranges: state in a chain -> range of the reference. A state needs one if the
+            system behaves differently elsewhere: the speed of a vehicle with drag, or
+            the angle of a pendulum. The law and the model then depend on it.
+        dwell: shortest and longest time between two changes of the reference [s].
+        held: states whose ξ is 0 where the system follows its reference, as many as
+            there are controls; () for the first state of every chain.
+
+    Raises:
+        ValueError: a chain, a range or an output does not fit; gives the reason.
+    """
+
+    outputs: Mapping[str, tuple[str, ...]]
+    _: KW_ONLY
+    reference: Mapping[tuple[str, ...], Ends]
+    ranges: Mapping[str, Ends]
+    dwell: tuple[float, float]
+    held: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.outputs or not self.reference:
+            raise ValueError("a frame needs an output and a reference")
+        listed = [state for chain in self.reference for state in chain]
+        if len(set(listed)) < len(listed):
+            raise ValueError(f"reference: a state is in two chains: {listed}")
+        for chain, ends in self.reference.items():
+            if not 1 <= len(chain) <= 2:
+                raise ValueError(f"reference: a chain has 1 or 2 states, got {chain}")
+            check_ends(f"reference: the rate of {chain[-1]}", ends)
+            if not ends[0] < 0.0 < ends[1]:
+                raise ValueError(f"reference: the rate of {chain[-1]} has no 0 inside")
+        for state, ends in self.ranges.items():
+            if state not in listed:
+                raise ValueError(f"ranges: {state} is in no chain of the reference")
+            check_ends(f"ranges: {state}", ends)
+        if not 0.0 < self.dwell[0] <= self.dwell[1]:
+            raise ValueError(f"dwell: two rising times above 0, got {self.dwell}")
+
+    @property
+    def chained(self) -> tuple[str, ...]:
+        """The states of the reference, chain after chain."""
+        return tuple(state for chain in self.reference for state in chain)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the entries of ρ."""
+        rates = (f"rate of {chain[-1]}" for chain in self.reference)
+        return (*rates, *self.ranges)
+
+    @property
+    def input_box(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper ends of ρ."""
+        ends = [*self.reference.values(), *self.ranges.values()]
+        low = tuple(float(pair[0]) for pair in ends)
+        return low, tuple(float(pair[1]) for pair in ends)
+
+
+def tracking(
+    outputs: Mapping[str, tuple[str, ...]],
+    *,
+    reference: Mapping[tuple[str, ...], Ends],
+    ranges: Mapping[str, Ends] | None = None,
+    dwell: tuple[float, float] = (0.5, 2.0),
+    held: tuple[str, ...] = (),
+) -> Tracking:
+    """Return coordinates relative to a reference that moves; see `Tracking`."""
+    return Tracking(
+        outputs,
+        reference=reference,
+        ranges=ranges or {},
+        dwell=dwell,
+        held=held,
+    )
+
+
+def regulation(
+    outputs: Mapping[str, tuple[str, ...]],
+    *,
+    set_points: Mapping[str, Ends],
+    rates: Mapping[str, float],
+    dwell: tuple[float, float] = (1.0, 4.0),
+    held: tuple[str, ...] = (),
+) -> Tracking:
+    """Return coordinates relative to set points; see `Tracking`.
+
+    Args:
+        outputs: name -> states.
+        set_points: state -> range of its set point.
+        rates: state -> largest rate at which its set point moves, to both sides.
+        dwell: shortest and longest time between two changes of the set points [s].
+        held: states that reach their set points, as many as there are controls; () for
+            all states of `set_points`.
+    """
+    if set(rates) != set(set_points):
+        raise ValueError(f"rates: one for each of {', '.join(set_points)}")
+    return Tracking(
+        outputs,
+        reference={(state,): (-rates[state], rates[state]) for state in set_points},
+        ranges=set_points,
+        dwell=dwell,
+        held=held,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A system in the coordinates of a frame, ξ⁺ = f(ξ, u, ρ, e).
+
+    Attributes:
+        system: the system.
+        frame: its coordinates.
+
+    Raises:
+        ValueError: the frame names a state that the system does not have, or as many
+            states as there are controls cannot be held.
+    """
+
+    system: System
+    frame: Tracking
+
+    def __post_init__(self) -> None:
+        frame = self.frame
+        named = [*frame.chained, *frame.held]
+        for states in frame.outputs.values():
+            named.extend(states)
+        for state in named:
+            if state not in self.names:
+                known = ", ".join(self.names)
+                raise ValueError(f"no state is called {state!r}; there are {known}")
+        if len(self.held) != len(self.system.controls):
+            raise ValueError(
+                f"held: as many states as there are controls "
+                f"({len(self.system.controls)}), got {[*frame.held] or 'none'}"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the states, and of the entries of ξ."""
+        return self.system.state_names
+
+    @cached_property
+    def held(self) -> tuple[int, ...]:
+        """Entries of ξ that are 0 where the system follows its reference."""
+        states = self.frame.held or tuple(chain[0] for chain in self.frame.reference)
+        return tuple(self.names.index(state) for state in states)
+
+    @cached_property
+    def chained(self) -> tuple[int, ...]:
+        """Entries of the state that the reference has."""
+        return tuple(self.names.index(state) for state in self.frame.chained)
+
+    @cached_property
+    def rows(self) -> dict[str, tuple[int, ...]]:
+        """Entries of ξ of each output."""
+        return {
+            name: tuple(self.names.index(state) for state in states)
+            for name, states in self.frame.outputs.items()
+        }
+
+    @cached_property
+    def model_frame(self) -> Frame:
+        """The frame of a model: a state is three zeros and ξ, a control (ν, ρ)."""
+        variables = self.system.state_variables
+        first = BODY.start
+        units = {name: variables[rows[0]].unit for name, rows in self.rows.items()}
+        angles = [first + i for i, state in enumerate(variables) if state.is_angle]
+        return Frame(
+            name="tracking",
+            has_pose=False,
+            outputs={
+                name: tuple(first + row for row in rows)
+                for name, rows in self.rows.items()
+            },
+            units=units,
+            angles=tuple(angles),
+            distances=(),
+            lengths=(1.0, 1.0, 1.0),
+            length=LENGTH,
+            inputs=len(self.frame.input_names),
+        )
+
+    def coordinates(self, state: State, reference: ReferenceState) -> Error:
+        """Return ξ of a state beside the reference."""
+        error = state - self._whole(reference)
+        is_angle = [variable.is_angle for variable in self.system.state_variables]
+        # An angle that the reference does not have is no difference, and stays.
+        wraps = np.isin(np.arange(len(self.names)), self.chained) & np.asarray(is_angle)
+        return jnp.where(wraps, wrap_angle(error), error)
+
+    def state(self, error: Error, reference: ReferenceState) -> State:
+        """Return the state with this ξ."""
+        return error + self._whole(reference)
+
+    def inputs(
+        self, reference: ReferenceState, rates: Float[Array, " chain"]
+    ) -> Inputs:
+        """Return ρ of a reference and the rates of its chains."""
+        chained = self.frame.chained
+        ranged = [reference[chained.index(state)] for state in self.frame.ranges]
+        return jnp.concatenate([rates, jnp.stack(ranged)]) if ranged else rates
+
+    def advance(
+        self, reference: ReferenceState, rates: Float[Array, " chain"]
+    ) -> ReferenceState:
+        """Return the reference one sampling period later, at constant rates."""
+        dt = self.system.dt
+        after = []
+        for chain, rate in zip(self.frame.reference, rates, strict=True):
+            first = reference[len(after)]
+            if len(chain) == 1:
+                after.append(first + rate * dt)
+                continue
+            second = reference[len(after) + 1]
+            after.append(first + second * dt + 0.5 * rate * dt**2)
+            after.append(second + rate * dt)
+        return jnp.stack(after)
+
+    def step(
+        self, error: Error, control: Control, inputs: Inputs, env: Environment
+    ) -> Error:
+        """Return ξ one sampling period later.
+
+        States of the reference without a range are 0 here: nothing depends on them, see
+        `check_invariance`, and numbers stay small.
+        """
+        reference = self._reference_of(inputs)
+        rates = inputs[: len(self.frame.reference)]
+        after = self.system.step(self.state(error, reference), control, env)
+        return self.coordinates(after, self.advance(reference, rates))
+
+    def rates_between(
+        self, reference: Float[Array, "point reference"]
+    ) -> Float[Array, "gap chain"]:
+        """Return the rates of the chains between the points of a reference."""
+        last = np.cumsum([len(chain) for chain in self.frame.reference]) - 1
+        return jnp.diff(reference[:, last], axis=0) / self.system.dt
+
+    def check_invariance(self, key: Key) -> None:
+        """Raise a ValueError if the system depends on a state of the reference.
+
+        Args:
+            key: of the places at which it is tried; consumed.
+        """
+        system = self.system
+        low, high = map(jnp.asarray, system.control_box)
+        envs = jnp.asarray(system.env_box)
+        control = jnp.clip(jnp.zeros(len(low)), low, high)
+        env = jnp.mean(envs, axis=0)
+        size = len(self.chained)
+        rates = jnp.zeros(len(self.frame.reference))
+
+        def moved(error: Error, reference: ReferenceState) -> Error:
+            after = system.step(self.state(error, reference), control, env)
+            return self.coordinates(after, self.advance(reference, rates)) - error
+
+        errors = 0.1 * jax.random.normal(key, (8, len(self.names)))
+        start = jax.vmap(moved, in_axes=(0, None))(errors, jnp.zeros(size))
+        scale = jnp.max(jnp.abs(start))
+        for index, state in enumerate(self.frame.chained):
+            if state in self.frame.ranges:
+                continue
+            beside = jnp.zeros(size).at[index].set(1.0)
+            change = jax.vmap(moved, in_axes=(0, None))(errors, beside) - start
+            if not np.max(np.abs(change)) <= INVARIANCE * scale:
+                raise ValueError(
+                    f"the system behaves differently where {state} of the reference is "
+                    f"another: give the range of the reference, as in "
+                    f'ranges={{"{state}": (-1.0, 1.0)}}'
+                )
+
+    def _whole(self, reference: ReferenceState) -> State:
+        """Return a state that is that of the reference, and 0 elsewhere."""
+        whole = jnp.zeros(len(self.names), reference.dtype)
+        return whole.at[np.asarray(self.chained)].set(reference)
+
+    def _reference_of(self, inputs: Inputs) -> ReferenceState:
+        """Return a reference with this ρ; what ρ does not say is 0."""
+        frame = self.frame
+        ranged = list(frame.ranges)
+        first = len(frame.reference)
+        entries = [
+            inputs[first + ranged.index(state)] if state in ranged else jnp.zeros(())
+            for state in frame.chained
+        ]
+        return jnp.stack(entries)
