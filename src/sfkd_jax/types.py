@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sfkd_jax.info import ControllerInfo
@@ -185,11 +184,11 @@ class Frame:
             for name, unit in self.units.items()
         }
 
-    def entries(self, output: str) -> slice | Int[np.ndarray, " entry"]:
+    def entries(self, output: str) -> slice | Int[Array, " entry"]:
         """Return the index of the entries of an output, along an axis of states."""
         entries = self.outputs[output]
         # A tuple would be an index of several axes.
-        return entries if isinstance(entries, slice) else np.asarray(entries, int)
+        return entries if isinstance(entries, slice) else jnp.asarray(entries, int)
 
 
 BODY_FRAME = Frame(
