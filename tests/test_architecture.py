@@ -19,13 +19,16 @@ PACKAGE = SRC.name
 COMMANDS = {"generate", "train", "certify", "evaluate", "compare", "demo"}
 COMMANDS |= {"collect"}
 """Modules that are commands alone; `export` and `report` are packages that run."""
-CORE = {"info", "types", "geometry", "rollout", "ranges", "latency"}
+CORE = {"info", "types", "geometry", "rollout", "ranges", "latency", "variables"}
 GROUND = {
     "info": set(),
     "types": {"info"},
     "ranges": set(),
+    "variables": set(),
     "geometry": {"types"},
     "rollout": {"types", "geometry"},
+    "schedules": {"types"},
+    "tables": set(),
     "latency": {"types", "geometry", "ranges"},
     "settings": {"ranges"},
     "store": set(),
@@ -36,9 +39,15 @@ GROUND = {
     "data": CORE,
     "evaluation": CORE,
     "certification": CORE | {"certificate", "data"},
+    "systems": CORE | {"certificate", "control", "schedules", "tables"},
+    "tubes": CORE | {"certificate", "certification", "systems"},
 }
 """The floor for any system with an environment: package -> what it may import."""
-ROAD = CORE | {f"driving.{name}" for name in ("path_coordinates", "paths", "lanes")}
+ROAD = (
+    CORE
+    | {"schedules", "tables"}
+    | {f"driving.{name}" for name in ("path_coordinates", "paths", "lanes")}
+)
 PLANT = ROAD | {"driving.plants", "driving.scenarios"}
 DRIVING = {
     "driving": set(),
@@ -73,11 +82,12 @@ APPLICATIONS = {
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}
     | {"certificate", "driving.certificate"},
-    "__init__": {"export", "geometry", "info", "latency", "policy", "store"},
+    "__init__": {"export", "geometry", "info", "latency", "policy", "store", "systems"},
 }
 """What puts the floors together."""
 ARROWS = GROUND | DRIVING | PAPER | APPLICATIONS
 ARROWS |= {"experiment": set(ARROWS)}
+ARROWS["__init__"] |= {"experiment"}
 ARROWS |= {name: set(ARROWS) for name in COMMANDS}
 OF_CARS = ("lateral", "heading", "speed", "speeds", "road", "roads", "along_path")
 OF_CARS += ("steering", "steer", "car", "cars")
@@ -88,6 +98,7 @@ COMMAND_LINE = {"hydra", "omegaconf", "numpy"}
 THIRD_PARTY = {
     "geometry": {"numpy"},
     "rollout": {"numpy"},
+    "tables": {"numpy"},
     "latency": {"numpy"},
     "store": {"numpy", "filelock", "safetensors"},
     "models": {"flax"},
@@ -97,6 +108,8 @@ THIRD_PARTY = {
     "certificate": {"cryptography"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
+    "systems": {"numpy", "cvxpy"},
+    "tubes": {"numpy"},
     "driving.path_coordinates": {"numpy"},
     "driving.smoothing": {"numpy", "scipy"},
     "driving.paths": {"numpy"},
@@ -154,7 +167,7 @@ LIBRARY = [
 ]
 """Files below the commands."""
 COMPILES = {"rollout", "policy", "training", "certification", "export", "data"}
-COMPILES |= {"driving.corridor", "driving.drives", "driving.logs"}
+COMPILES |= {"systems", "tubes", "driving.corridor", "driving.drives", "driving.logs"}
 """Packages that run on the host, and may call `jax.jit`; so may gymnasium's adapter."""
 
 

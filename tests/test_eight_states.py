@@ -13,12 +13,12 @@ from helpers import ENV_HIGH, ENV_LOW, any_law, driver, jit
 from sfkd_jax import assembly, models, policy
 from sfkd_jax.driving import drives, plants, simulation
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
-from sfkd_jax.types import StateVariable
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.latency import Latency
 from sfkd_jax.report.run import write_report
 from sfkd_jax.settings import schema
 from sfkd_jax.types import Controller
+from sfkd_jax.variables import StateVariable
 from tests.report import pages_of_runs as made
 
 LAW = any_law(7)

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sfkd_jax.experiment.systems import certify_system as certify_system
     from sfkd_jax.export import warm_up as warm_up
     from sfkd_jax.geometry import relative as relative
     from sfkd_jax.info import Reason as Reason
@@ -12,6 +13,10 @@ if TYPE_CHECKING:
     from sfkd_jax.policy import load as load
     from sfkd_jax.policy import policies as policies
     from sfkd_jax.store import ArtefactError as ArtefactError
+    from sfkd_jax.systems import System as System
+    from sfkd_jax.systems import integrated as integrated
+    from sfkd_jax.systems import regulation as regulation
+    from sfkd_jax.systems import tracking as tracking
 
 __version__ = "0.1.0"
 
@@ -24,6 +29,11 @@ _LAZY = {
     "ArtefactError": "store",
     "Reason": "info",
     "Latency": "latency",
+    "System": "systems",
+    "integrated": "systems",
+    "tracking": "systems",
+    "regulation": "systems",
+    "certify_system": "experiment.systems",
 }
 
 

@@ -73,7 +73,15 @@ def train_policy(
     recorded["best_step"] = best_step
     if model.planning is not None:
         planning_key = jax.random.fold_in(key, 1)
-        residual = _fit_planning(training, model, params, space, dataset, planning_key)
+        residual = fit_planning(
+            model,
+            params,
+            space,
+            dataset.train,
+            planning_key,
+            steps=training.steps,
+            size=training.loss.size,
+        )
         params = {**params, "planning": residual}
     document = _open_loop_document(source, model, params, horizon=training.window)
     document["validation_score"] = _validation_score(training, loss, params, dataset)
@@ -114,23 +122,35 @@ def _fit_model(
     )
 
 
-def _fit_planning(
-    training: TrainingSettings,
+def fit_planning(
     model: Model,
     params: Params,
     space: Space,
-    dataset: Dataset,
+    data: Trajectory,
     key: Key,
+    *,
+    steps: int,
+    size: float = 1.0,
 ) -> Params:
-    """Return the weights of the residual g that planners add to the model's steps."""
+    """Return the weights of the residual g that planners add to the model's steps.
+
+    Args:
+        model: with a residual for planners.
+        params: of the model.
+        space: its scales.
+        data: the training trajectories.
+        key: for the batches; consumed.
+        steps: optimiser steps of the model itself.
+        size: of the system, see `training.multi_step_loss`.
+    """
     store.print_message("training what planners add to its steps")
     return descend(
         params["planning"],
-        planning_loss(model, params, space, training.loss.size),
+        planning_loss(model, params, space, size),
         partial(random_windows, batch=PLANNING_BATCH, length=1),
-        dataset.train,
+        data,
         key,
-        steps=PLANNING_STEPS * training.steps,
+        steps=PLANNING_STEPS * steps,
         learning_rate=PLANNING_RATE,
     )
 

@@ -28,12 +28,22 @@ from sfkd_jax.policy._description import describe, interface_of
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
 from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
 from sfkd_jax.policy._shipped import policies as policies
+from sfkd_jax.policy._system_policy import SystemPolicy as SystemPolicy
+from sfkd_jax.policy._system_policy import TrainedSystem as TrainedSystem
+from sfkd_jax.policy._system_policy import describe_system as describe_system
+from sfkd_jax.policy._system_policy import is_system as is_system
+from sfkd_jax.policy._system_policy import load_system as load_system
+from sfkd_jax.policy._system_policy import planner_of as planner_of
+from sfkd_jax.policy._system_policy import restore_system as restore_system
+from sfkd_jax.policy._system_policy import save_system as save_system
+from sfkd_jax.policy._system_policy import shielded as shielded
+from sfkd_jax.policy._system_policy import system_file as system_file
 from sfkd_jax.policy._trained import KIND as KIND
 from sfkd_jax.policy._trained import LAW as LAW
 from sfkd_jax.policy._trained import TrainedModel as TrainedModel
 from sfkd_jax.policy._trained import built as built
+from sfkd_jax.policy._trained import in_policy_numerics, policy_numerics
 from sfkd_jax.policy._trained import policy_file as policy_file
-from sfkd_jax.policy._trained import policy_numerics
 from sfkd_jax.policy._trained import restore as restore
 from sfkd_jax.policy._trained import save as save
 from sfkd_jax.rollout import fold, on_host, unfold
@@ -145,7 +155,7 @@ class Policy(TrainedModel):
             )
         if capacity is not None:
             controller = _with_capacity(controller, capacity)
-        return _in_policy_numerics(controller)
+        return in_policy_numerics(controller)
 
     def __reduce__(self) -> Any:
         """Refuse to be pickled; functions of a closure say less clearly why."""
@@ -169,7 +179,8 @@ def load(
 ) -> Policy:
     """Return the policy in a run directory, with its certificate verified.
 
-    Without a certificate it warns and gives the reason.
+    Without a certificate it warns and gives the reason. Of a directory that
+    `certify_system` has made it returns a `SystemPolicy`.
 
     Args:
         path: path of the directory or of a policy.safetensors, or the name of a policy
@@ -193,6 +204,11 @@ def load(
         ValueError: `controller`, `env_source` or `latency` does not fit the policy, or
             an estimate is asked of a policy that is not in path coordinates.
     """
+    if is_system(path):
+        if controller or latency or adaptive or signed_by or env_source != "measured":
+            raise ValueError(f"{path} is the policy of a system: load it by path alone")
+        policy_of_system: Any = load_system(path)
+        return policy_of_system
     file = policy_file(path)
     trained = restore(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
@@ -328,14 +344,6 @@ def _with_capacity(controller: Controller, capacity: tuple[int, int]) -> Control
     return Controller(jax.jit(controller.init), act)
 
 
-def _in_policy_numerics(controller: Controller) -> Controller:
-    """Return the same controller, which sets the numerics of a policy for itself."""
-    return Controller(
-        init=policy_numerics()(controller.init),
-        act=policy_numerics()(controller.act),
-    )
-
-
 def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
     """Return the same controller, with `policy_numerics` and a check of its arguments.
 
@@ -379,4 +387,4 @@ def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
             info = info._replace(plan=info.plan._replace(states=states))
         return control, state, info
 
-    return _in_policy_numerics(Controller(init, act))
+    return in_policy_numerics(Controller(init, act))

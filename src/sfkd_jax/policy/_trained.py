@@ -18,7 +18,7 @@ from sfkd_jax.driving.path_following import PathLaw, law_from_arrays
 from sfkd_jax.driving.plants import Vehicle
 from sfkd_jax.policy._shipped import POLICY_FILE, SHIPPED, shipped_names
 from sfkd_jax.settings import Values
-from sfkd_jax.types import Model, Params
+from sfkd_jax.types import Controller, Model, Params
 
 KIND = "policy"
 """The kind of artefact that the manifest of policy.safetensors states."""
@@ -60,6 +60,14 @@ def policy_numerics() -> Iterator[None]:
         yield
 
 
+def in_policy_numerics(controller: Controller) -> Controller:
+    """Return the same controller, which sets the numerics of a policy for itself."""
+    return Controller(
+        init=policy_numerics()(controller.init),
+        act=policy_numerics()(controller.act),
+    )
+
+
 def save(
     path: Path,
     params: Params,
@@ -82,7 +90,7 @@ def save(
         # Beside the weights: the hash that certificates refer to then covers the law.
         tree = {**params, LAW: law._asdict()}
     return store.write_arrays(
-        path, _by_path(tree), kind=KIND, config=settings, made_from=made_from
+        path, arrays_of(tree), kind=KIND, config=settings, made_from=made_from
     )
 
 
@@ -122,7 +130,7 @@ def restore(path: str | Path) -> TrainedModel:
         law = law_from_arrays(tables) if model.frame.inputs else None
     return TrainedModel(
         model=model,
-        params=_as_params(file, arrays, shapes),
+        params=params_from_arrays(file, arrays, shapes),
         vehicle=vehicle,
         law=law,
         settings=settings,
@@ -182,9 +190,11 @@ def policy_file(path: str | Path) -> Path:
     return file / POLICY_FILE
 
 
-def _as_params(file: Path, arrays: Mapping[str, np.ndarray], shapes: Any) -> Params:
+def params_from_arrays(
+    file: Path, arrays: Mapping[str, np.ndarray], shapes: Any
+) -> Params:
     """Return arrays as parameters of these shapes, or raise an ArtefactError."""
-    leaves = _by_path(shapes)
+    leaves = arrays_of(shapes)
     stored = _dtypes_and_shapes(arrays)
     expected = _dtypes_and_shapes(leaves)
     # Both ways: a weight too many is another model as well.
@@ -205,7 +215,7 @@ def _dtypes_and_shapes(leaves: Mapping[str, Any]) -> dict[str, str]:
     return {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in leaves.items()}
 
 
-def _by_path(tree: Any) -> dict[str, Any]:
+def arrays_of(tree: Any) -> dict[str, Any]:
     """Return the leaves by path, "a/b/c", in the order of the tree."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="/"): leaf

@@ -14,16 +14,27 @@ from sfkd_jax.geometry import without_pose
 from sfkd_jax.ranges import Span
 from sfkd_jax.schedules import random_switching, within
 from sfkd_jax.systems._closed_loop import ClosedLoop
+from sfkd_jax.systems._law import Law
 from sfkd_jax.systems._system import Ends
 from sfkd_jax.systems._tracking import Error, ReferenceState, Tracked
-from sfkd_jax.types import BODY, Key, Scalar, Trajectory
+from sfkd_jax.types import (
+    BODY,
+    Control,
+    Environment,
+    Key,
+    Scalar,
+    State,
+    Trajectory,
+)
 
 SMALLEST = 0.01
 """Smallest size of ν and of the errors at the start, relative to the largest."""
 SLOWEST = 0.95
 """Largest autocorrelation of ν from a step to the next."""
-SPREAD_RUNS = 64
-"""Number of runs that tell how far the loop moves."""
+TRIALS = 64
+"""Number of runs that tell how far a loop moves, and whether it saturates."""
+ROUNDING = 1e-4
+"""Share of the range of a control that counts as its limit."""
 BRAKING = 0.8
 """Share of the largest rate that a reference plans to stop with."""
 
@@ -114,9 +125,9 @@ def _profile(tracked: Tracked, chain: tuple[str, ...]) -> Profile:
 
     def towards(first: Scalar, last: Scalar, goal: Scalar) -> Scalar:
         way = goal - first
-        # The speed from which it still stops at the goal.
-        speed = jnp.minimum(jnp.sqrt(2.0 * braking * jnp.abs(way)), jnp.abs(way) / dt)
-        return limited(last, (jnp.sign(way) * speed - last) / dt)
+        # The rate from which it still stops at the goal.
+        rate = jnp.minimum(jnp.sqrt(2.0 * braking * jnp.abs(way)), jnp.abs(way) / dt)
+        return limited(last, (jnp.sign(way) * rate - last) / dt)
 
     return towards
 
@@ -242,19 +253,68 @@ def random_runs(
         noisy: whether the law reads sensors with noise.
     """
     noise = jnp.asarray(loop.tracked.system.sensor_noise) * noisy
+    keys = jax.random.split(key, count)
+    return _simulated(loop.tracked, steps, dwell, loop.law, keys, spread, noise)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _simulated(
+    tracked: Tracked,
+    steps: int,
+    dwell: Span,
+    law: Law,
+    keys: Key,
+    spread: Float[Array, " state"],
+    noise: Float[Array, " state"],
+) -> Trajectory:
+    """Return the runs of `random_runs`; laws share a program."""
+    loop = ClosedLoop(tracked, law)
 
     def run(key: Key) -> Trajectory:
         draw_key, run_key = jax.random.split(key)
         drawn = draw_run(loop, draw_key, steps=steps, dwell=dwell)
         return simulate(loop, drawn, run_key, spread=spread, noise=noise)
 
-    return jax.jit(jax.vmap(run))(jax.random.split(key, count))
+    return jax.vmap(run)(keys)
+
+
+def _from_steady(loop: ClosedLoop, key: Key, steps: int, dwell: Span) -> Trajectory:
+    """Return a few runs that begin at steady states."""
+    return random_runs(
+        loop,
+        key,
+        count=TRIALS,
+        steps=steps,
+        dwell=dwell,
+        spread=jnp.zeros(len(loop.tracked.names)),
+        noisy=True,
+    )
 
 
 def spread_of(
     loop: ClosedLoop, key: Key, *, steps: int, dwell: Span
 ) -> Float[Array, " state"]:
     """Return the standard deviations of ξ in runs that begin at steady states."""
-    draw = partial(random_runs, loop, count=SPREAD_RUNS, steps=steps, dwell=dwell)
-    runs = draw(key, spread=jnp.zeros(len(loop.tracked.names)), noisy=False)
-    return jnp.std(runs.states[..., BODY].reshape(-1, len(loop.tracked.names)), axis=0)
+    states = _from_steady(loop, key, steps, dwell).states[..., BODY]
+    return jnp.std(states.reshape(-1, len(loop.tracked.names)), axis=0)
+
+
+def saturation(loop: ClosedLoop, key: Key, *, steps: int, dwell: Span) -> float:
+    """Return the share of steps in which a control is at its limit.
+
+    It is 1 if a run is not finite.
+    """
+    runs = _from_steady(loop, key, steps, dwell)
+
+    def at_limit(state: State, control: Control, env: Environment) -> Array:
+        nu, inputs = loop.split(control)
+        wanted = loop.law.at(inputs, env).feedback(state[BODY]) + nu
+        low, high = map(jnp.asarray, loop.tracked.system.control_box)
+        room = ROUNDING * (high - low)
+        return jnp.any((wanted <= low + room) | (wanted >= high - room))
+
+    limited = jax.vmap(jax.vmap(at_limit))(
+        runs.states[:, :-1], runs.controls, runs.envs
+    )
+    finite = jnp.all(jnp.isfinite(runs.states))
+    return float(jnp.where(finite, jnp.mean(limited), 1.0))

@@ -15,15 +15,8 @@ from jaxtyping import Array, Float
 
 from sfkd_jax.ranges import AtLeastOne, Positive, check_intervals
 from sfkd_jax.rollout import runge_kutta
-from sfkd_jax.types import (
-    Control,
-    ControlVariable,
-    Environment,
-    EnvironmentVariable,
-    State,
-    StateVariable,
-    Step,
-)
+from sfkd_jax.types import Control, Environment, State, Step
+from sfkd_jax.variables import ControlVariable, EnvironmentVariable, StateVariable
 
 Ends = tuple[float, float]
 """Lower and upper end of a range."""

@@ -44,7 +44,7 @@ class Tracking:
         outputs: name -> states; of each output a tube is certified.
         reference: chain of one or two states -> range of the rate of the last of them.
         ranges: state in a chain -> range of the reference. A state needs one if the
-            system behaves differently elsewhere: the speed of a vehicle with drag, or
+            system behaves differently elsewhere: the velocity of a body with drag, or
             the angle of a pendulum. The law and the model then depend on it.
         dwell: shortest and longest time between two changes of the reference [s].
         held: states whose ξ is 0 where the system follows its reference, as many as

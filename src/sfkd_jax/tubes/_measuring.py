@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import jax
@@ -149,7 +149,7 @@ def _scores(
     model: Model,
     params: Params,
     claims: Mapping[str, OutputMetric],
-    nominal: object,
+    nominal: Callable[[Trajectory, Key], tuple[Array, Array]],
     runs: Trajectory,
     key: Key,
 ) -> tuple[Float[np.ndarray, "run bound"], Float[np.ndarray, "run output"]]:
@@ -158,8 +158,7 @@ def _scores(
     The bounds are the tubes of all outputs, then those of the nominal model.
     """
     keys = jax.random.split(key, len(runs.states))
-    simulate: object = nominal
-    predicted, gaps = (np.asarray(part, np.float64) for part in simulate(runs, keys))
+    predicted, gaps = (np.asarray(part, np.float64) for part in nominal(runs, keys))
     errors = residuals(model, params, runs)
     tubes = [radii(errors, name, claim, gaps)[FORM] for name, claim in claims.items()]
     true = np.asarray(runs.states, np.float64)[:, 1:, BODY]

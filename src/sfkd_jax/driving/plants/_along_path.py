@@ -15,16 +15,8 @@ from sfkd_jax.driving.path_coordinates import (
 )
 from sfkd_jax.driving.plants._vehicle import SPEED_RANGE, Vehicle
 from sfkd_jax.geometry import without_pose
-from sfkd_jax.types import (
-    BODY,
-    Control,
-    ControlVariable,
-    Environment,
-    Scalar,
-    State,
-    StateVariable,
-    Step,
-)
+from sfkd_jax.types import BODY, Control, Environment, Scalar, State, Step
+from sfkd_jax.variables import ControlVariable, StateVariable
 
 LARGEST_CURVATURE = 0.2
 """Limit of the curvature of a path [1/m]; no car can turn as tightly."""

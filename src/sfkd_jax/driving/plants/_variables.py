@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from sfkd_jax.types import ControlVariable, EnvironmentVariable, StateVariable
+from sfkd_jax.variables import ControlVariable, EnvironmentVariable, StateVariable
 
 
 class Size(NamedTuple):

@@ -16,17 +16,8 @@ from sfkd_jax.driving.plants._variables import (
     Size,
 )
 from sfkd_jax.rollout import runge_kutta
-from sfkd_jax.types import (
-    GRAVITY,
-    Control,
-    ControlVariable,
-    Environment,
-    EnvironmentVariable,
-    Scalar,
-    State,
-    StateVariable,
-    Step,
-)
+from sfkd_jax.types import GRAVITY, Control, Environment, Scalar, State, Step
+from sfkd_jax.variables import ControlVariable, EnvironmentVariable, StateVariable
 
 CAR_CONTROLS = (
     STEERING._replace(low=-0.5, high=0.5),

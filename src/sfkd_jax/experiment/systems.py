@@ -1,0 +1,367 @@
+"""From a system to a policy with a certificate: `certify_system`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cached_property, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sfkd_jax import models, policy, store
+from sfkd_jax.certificate import Provenance, Refusal, write
+from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
+from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
+from sfkd_jax.experiment import run_directory
+from sfkd_jax.experiment.fitting import fit_planning
+from sfkd_jax.policy import CERTIFICATE, SystemPolicy, TrainedSystem
+from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, Span, check_intervals
+from sfkd_jax.rollout import fold, on_host
+from sfkd_jax.systems import (
+    ClosedLoop,
+    System,
+    SystemCertificate,
+    Tracked,
+    Tracking,
+    derive_law,
+    fastest_law,
+    random_runs,
+    spread_of,
+    steady_states,
+)
+from sfkd_jax.training import fit, multi_step_loss
+from sfkd_jax.tubes import measure_tubes
+from sfkd_jax.types import BODY, Key, Trajectory
+
+BATCH = 128
+"""Windows in a batch of the training."""
+WINDOW = 20
+"""Steps of a window."""
+TUBE = 0.5
+"""Weight of the tube in the training loss."""
+PART_SIZES = (6000, 400, 400, 400)
+"""Number of segments of the parts of the data, at full size."""
+SMALLEST_PART = 64
+"""Smallest number of segments of a part."""
+FIRST_PART = 10
+"""Stream of the random keys of the first part."""
+SEGMENT = 60
+"""Steps of a segment."""
+SPREAD_STEPS = 300
+"""Steps of the runs that tell how far the loop moves."""
+PROBES = 4
+"""Number of places at which the step is recorded, so that another one is noticed."""
+MODEL = {
+    "lift": "state",
+    "scheduled": True,
+    "transport": False,
+    "forcing_hidden": 64,
+    "learn_alpha": True,
+    "residual_hidden": [64, 64],
+    "planning_residual": True,
+}
+"""Settings of `models.sfkd` for closed loops, besides those that follow from the law.
+"""
+BUDGET = 0.08
+"""β of the model; ρ is what is left to `LARGEST_RATE`."""
+LARGEST_RATE = 0.995
+"""Largest contraction rate that a model may learn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TubeSettings:
+    """How a system is certified.
+
+    Attributes:
+        rate: contraction rate of the law; None for the fastest that hardly saturates.
+        points: of the table of the law, on every axis.
+        perturbation: largest |ν|, relative to half of the range of each control.
+        dwell: range of times between two switches of e [s].
+        segments: share of the data at full size.
+        steps: optimiser steps of the training.
+        runs: number of runs of each part that calibrates or tests the tubes.
+        duration: of these runs [s].
+        level: 1 − δ.
+        samples: of the planner.
+        horizon: of the planner [steps].
+        seed: of everything.
+    """
+
+    rate: Fraction | None = None
+    points: AtLeastOne = 5
+    perturbation: Fraction = 0.05
+    dwell: Span = (1.0, 4.0)
+    segments: Fraction | float = 1.0
+    steps: AtLeastOne = 6000
+    runs: AtLeastOne = 300
+    duration: Positive = 30.0
+    level: Fraction = 0.95
+    samples: AtLeastOne = 300
+    horizon: AtLeastOne = 20
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SystemRun:
+    """A system in its run directory.
+
+    Every property is computed, loaded or made when it is first asked for, and kept.
+
+    Attributes:
+        tracked: the system in the coordinates of its frame.
+        settings: of the run.
+        directory: of the run.
+    """
+
+    tracked: Tracked
+    settings: TubeSettings
+    directory: Path
+
+    def key(self, stream: int) -> Key:
+        """Return the random key of one use."""
+        return jax.random.fold_in(jax.random.key(self.settings.seed), stream)
+
+    @cached_property
+    def loop(self) -> ClosedLoop:
+        """The system with its law."""
+        settings = self.settings
+        steady = steady_states(self.tracked, points=settings.points)
+        if settings.rate is not None:
+            law = derive_law(
+                self.tracked,
+                steady,
+                rate=settings.rate,
+                perturbation=settings.perturbation,
+            )
+            return ClosedLoop(self.tracked, law)
+        law, rate = fastest_law(
+            self.tracked,
+            steady,
+            self.key(0),
+            dwell=settings.dwell,
+            perturbation=settings.perturbation,
+        )
+        store.print_message(f"the law contracts at {rate:g} a step in one metric")
+        return ClosedLoop(self.tracked, law)
+
+    @cached_property
+    def spread(self) -> Float[Array, " state"]:
+        """Standard deviations of ξ under the law."""
+        return spread_of(
+            self.loop, self.key(1), steps=SPREAD_STEPS, dwell=self.settings.dwell
+        )
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """Simulated segments of the loop, without noise of the sensors."""
+        draw = partial(
+            random_runs,
+            self.loop,
+            steps=SEGMENT,
+            dwell=self.settings.dwell,
+            spread=self.spread,
+            noisy=False,
+        )
+        parts: list[Trajectory] = []
+        for stream, count in enumerate(PART_SIZES):
+            size = max(SMALLEST_PART, round(count * self.settings.segments))
+            parts.append(draw(self.key(FIRST_PART + stream), count=size))
+        low, high = map(jnp.asarray, self.tracked.system.env_box)
+        return Dataset(*parts, env_low=low, env_high=high)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what determines the weights, as plain values."""
+        probes = np.asarray(_probes(self.tracked, self.key(2)))
+        return store.plain(
+            {
+                **policy.describe_system(self.tracked),
+                "settings": vars(self.settings),
+                # Of a function nothing but its values can be compared.
+                "step": [[float(f"{value:.4g}") for value in row] for row in probes],
+            }
+        )
+
+    def trained(self) -> TrainedSystem:
+        """Return the policy of the run; it is trained, or trained on, if missing."""
+        file = policy.system_file(self.directory)
+        run_directory.claim(self.directory, file, self.identity())
+        if not file.is_file():
+            self._train(file)
+        return policy.restore_system(self.directory)
+
+    def _train(self, file: Path) -> None:
+        """Train and write the policy."""
+        settings = self.settings
+        dataset = self.dataset
+        space = measure_space(dataset)
+        model_settings = {**MODEL, "rho": LARGEST_RATE - BUDGET, "beta": BUDGET}
+        model = models.sfkd(space, frame=self.tracked.model_frame, **model_settings)
+        rows = {row for rows in self.tracked.rows.values() for row in rows}
+        weights = [TUBE if row in rows else 0.0 for row in range(max(rows) + 1)]
+        loss = multi_step_loss(model, space, tube=tuple(weights))
+        store.print_message(f"training {settings.steps} steps, in {self.directory}")
+        params, _ = fit(
+            model,
+            loss,
+            partial(random_windows, batch=BATCH, length=WINDOW),
+            dataset.train,
+            spread_windows(dataset.validation, length=WINDOW),
+            self.key(3),
+            self.directory,
+            steps=settings.steps,
+        )
+        residual = fit_planning(
+            model, params, space, dataset.train, self.key(4), steps=settings.steps
+        )
+        low, high = self.tracked.system.env_box
+        policy.save_system(
+            file,
+            {**params, "planning": residual},
+            self.loop.law,
+            {
+                **self.identity(),
+                "model": model_settings,
+                "space": space._asdict(),
+                "environment": {"low": low, "high": high},
+                "controller": self._controller(),
+            },
+        )
+
+    def _controller(self) -> dict[str, Any]:
+        """Return the settings of the planner."""
+        states = np.asarray(self.dataset.train.states[..., BODY])
+        scales = {
+            name: float(np.sqrt(np.mean(states[..., list(rows)] ** 2)))
+            for name, rows in self.tracked.rows.items()
+        }
+        return {
+            "samples": self.settings.samples,
+            "horizon": self.settings.horizon,
+            "effective_samples": 0.1 * self.settings.samples,
+            "noise": 0.3,
+            "smoothness": 0.02,
+            "scales": scales,
+        }
+
+    def certificate(self, trained: TrainedSystem) -> SystemCertificate | Refusal:
+        """Certify the policy; write and return the certificate."""
+        began = time.perf_counter()
+        provenance = Provenance(
+            policy_sha256=trained.sha256,
+            weights_sha256=trained.weights_sha256,
+            versions={**store.versions(), "scipy": version("scipy")},
+            seconds=0.0,
+            settings=store.plain(vars(self.settings)),
+        )
+        try:
+            certificate = self._certify(trained, provenance, began)
+        except CertificationRefused as reason:
+            certificate = Refusal(reason=str(reason), provenance=provenance)
+        write(self.directory / CERTIFICATE, certificate)
+        return certificate
+
+    def _certify(
+        self, trained: TrainedSystem, provenance: Provenance, began: float
+    ) -> SystemCertificate:
+        """Prove, and measure on segments and on whole runs."""
+        dataset = self.dataset
+        boxes = boxes_of(dataset)
+        proof = prove(
+            trained.model, trained.params, boxes.env, validation=dataset.validation
+        )
+        if not proof.outputs:
+            raise CertificationRefused("no metric of the outputs was found")
+        proved = time.perf_counter() - began
+        measured = measure(
+            trained.model,
+            trained.params,
+            proof,
+            validation=dataset.validation,
+            calibration=dataset.calibration,
+            held_out={"test": dataset.test},
+            boxes=boxes,
+            level=self.settings.level,
+        )
+        store.print_message(f"alpha {proof.alpha:.4f}; measuring tubes")
+        tubes = measure_tubes(
+            # The law as it is stored, around the step of the system.
+            ClosedLoop(self.tracked, trained.loop.law),
+            trained.model,
+            fold(trained.model, trained.params, on_host),
+            {name: proof.outputs[name] for name in self.tracked.rows},
+            self.key(5),
+            spread=self.spread,
+            runs=self.settings.runs,
+            duration=self.settings.duration,
+            dwell=self.settings.dwell,
+            level=self.settings.level,
+        )
+        provenance = Provenance(
+            **{
+                **vars(provenance),
+                "seconds": time.perf_counter() - began,
+                "seconds_proof": proved,
+            }
+        )
+        return SystemCertificate(
+            proof=proof, measured=measured, tubes=tubes, provenance=provenance
+        )
+
+
+def certify_system(
+    system: System, frame: Tracking, *, root: str | Path, **settings: Any
+) -> SystemPolicy:
+    """Return a policy of a system with its certificate; everything is kept in `root`.
+
+    A law is derived and simulated, a model of the closed loop is learned from the runs
+    and proved to contract, and tubes of the outputs are calibrated on whole runs. The
+    same call continues what was interrupted.
+
+    Args:
+        system: its step, which jax differentiates.
+        frame: what it follows, see `tracking` and `regulation`.
+        root: directory of the run.
+        settings: fields of `TubeSettings`.
+
+    Raises:
+        ValueError: system, frame or settings do not fit; `systems.NoLaw` if there is no
+            law.
+        CertificationRefused: the model could not be certified.
+        ArtefactError: the directory has a run of another system or other settings.
+    """
+    parsed = TubeSettings(**settings)
+    check_intervals(parsed)
+    tracked = Tracked(system, frame)
+    system.check_step()
+    tracked.check_invariance(jax.random.key(0))
+    run = SystemRun(tracked, parsed, Path(root))
+    with store.locked(run.directory):
+        trained = run.trained()
+        path = run.directory / CERTIFICATE
+        if not path.is_file():
+            certificate = run.certificate(trained)
+            if isinstance(certificate, Refusal):
+                raise CertificationRefused(certificate.reason)
+    return policy.load_system(run.directory)
+
+
+def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:
+    """Return what the step does at a few places."""
+    low, high = map(jnp.asarray, tracked.system.control_box)
+    bottom, top = map(jnp.asarray, tracked.system.env_box)
+    size = len(tracked.names)
+
+    def probe(key: Key) -> Array:
+        state_key, control_key, env_key = jax.random.split(key, 3)
+        state = 0.3 * jax.random.normal(state_key, (size,))
+        control = jax.random.uniform(control_key, low.shape, minval=low, maxval=high)
+        env = jax.random.uniform(env_key, bottom.shape, minval=bottom, maxval=top)
+        return tracked.system.step(state, control, env)
+
+    return jax.vmap(probe)(jax.random.split(key, PROBES))

@@ -1,0 +1,202 @@
+"""The law of a system: gains whose closed loop contracts in one metric."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sfkd_jax.ranges import Fraction, Span
+from sfkd_jax.systems._closed_loop import ClosedLoop
+from sfkd_jax.systems._law import Law
+from sfkd_jax.systems._runs import saturation
+from sfkd_jax.systems._steady_states import NoLaw, SteadyStates
+from sfkd_jax.systems._tracking import Tracked
+from sfkd_jax.types import Key
+
+SENSORS = 0.01
+"""Share of the variance of the sensors that counts as a disturbance of a step."""
+GROWTH_STEPS = 10
+"""Steps over which disturbances grow that scale the states of a semidefinite program.
+"""
+RATES = (0.7, 0.75, 0.8, 0.83, 0.86, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+"""Rates that are tried, fastest first."""
+SATURATED = 0.01
+"""Largest share of steps in which a control is at its limit."""
+TRIAL_STEPS = 300
+"""Steps of the runs with which a law is tried."""
+
+
+def fastest_law(
+    tracked: Tracked,
+    steady: SteadyStates,
+    key: Key,
+    *,
+    dwell: Span,
+    perturbation: Fraction = 0.05,
+) -> tuple[Law, float]:
+    """Return the law of the fastest of `RATES` that hardly saturates, and its rate.
+
+    A law is tried on simulated runs. Where a control is at its limit, the loop is open.
+
+    Args:
+        tracked: the system.
+        steady: its steady states.
+        key: of the runs, the same for every law; consumed.
+        dwell: range of times between two switches of e [s].
+        perturbation: largest |ν|, relative to half of the range of each control.
+
+    Raises:
+        NoLaw: the law of every rate saturates, or does not exist.
+    """
+    reason = ""
+    for rate in RATES:
+        try:
+            law = derive_law(tracked, steady, rate=rate, perturbation=perturbation)
+        except NoLaw as failure:
+            reason = str(failure)
+            continue
+        share = saturation(
+            ClosedLoop(tracked, law), key, steps=TRIAL_STEPS, dwell=dwell
+        )
+        if share <= SATURATED:
+            return law, rate
+        reason = (
+            f"saturation: at a rate of {rate:g} a control is at its limit in "
+            f"{100 * share:.0f} % of the steps. Make the reference slower, or the "
+            "ranges smaller"
+        )
+    raise NoLaw(reason)
+
+
+def derive_law(
+    tracked: Tracked,
+    steady: SteadyStates,
+    *,
+    rate: Fraction,
+    perturbation: Fraction = 0.05,
+) -> Law:
+    """Return the law with the least effort whose closed loop contracts at a rate.
+
+        minimise  mean_i tr Z_i   over X, Y_i, Z_i
+        (A_i X − B_i Y_i) in [α² X, X],   A_cl X A_cl' + W ≤ X,   [Z_i Y_i; Y_i' X] ≥ 0
+        K_i = Y_i X⁻¹
+
+    One metric X⁻¹ serves all corners i of the table: what switches between them
+    contracts as well, and so can a model with one certificate for all of them. X is a
+    bound of the covariance of ξ under the disturbances W: changes of the steady state,
+    ν and noise. Gains inside the table are interpolated.
+
+    Args:
+        tracked: the system.
+        steady: its steady states.
+        rate: α.
+        perturbation: largest |ν|, relative to half of the range of each control.
+
+    Raises:
+        NoLaw: no gains contract at this rate in one metric.
+
+    Source: Boyd, El Ghaoui, Feron and Balakrishnan (1994), Linear Matrix Inequalities
+        in System and Control Theory, chapters 5 and 7.
+    """
+    low, high = map(np.asarray, tracked.system.control_box)
+    half_ranges = 0.5 * (high - low)
+    disturbance = _disturbance(tracked, steady, perturbation * half_ranges)
+    gains = _contracting_gains(steady, disturbance, half_ranges, rate)
+    if gains is None:
+        raise NoLaw(
+            f"no gains contract {', '.join(tracked.names)} at a rate of {rate:g} in "
+            "one metric for all references and e"
+        )
+    gains = _interpolated_inside(steady, gains)
+
+    def table(values: np.ndarray) -> Array:
+        shape = (*steady.counts, *values.shape[1:])
+        return jnp.asarray(values.reshape(shape), jnp.float32)
+
+    return Law(
+        low=jnp.asarray(steady.low, jnp.float32),
+        high=jnp.asarray(steady.high, jnp.float32),
+        perturbation=jnp.asarray(perturbation * half_ranges, jnp.float32),
+        state=table(steady.states),
+        control=table(steady.controls),
+        gain=table(gains),
+    )
+
+
+def _disturbance(
+    tracked: Tracked, steady: SteadyStates, perturbation: np.ndarray
+) -> np.ndarray:
+    """Return W, the covariance of what disturbs a step.
+
+    Reference and e change once in a mean dwell, to a place of the table whose steady
+    state is another one.
+    """
+    dt = tracked.system.dt
+    size = len(tracked.names)
+    changes = 2.0 * dt / np.mean(tracked.frame.dwell)
+    B = steady.slopes[len(steady.slopes) // 2][:, size:]
+    pushed = B * (0.5 * perturbation)
+    noise = np.asarray(tracked.system.sensor_noise)
+    of_steady = changes * np.cov(steady.states.T).reshape(size, size)
+    return of_steady + pushed @ pushed.T + SENSORS * np.diag(noise**2)
+
+
+def _contracting_gains(
+    steady: SteadyStates, disturbance: np.ndarray, half_ranges: np.ndarray, rate: float
+) -> np.ndarray | None:
+    """Return the gains at the corners of the table, see `derive_law`; None if none."""
+    import cvxpy as cp
+
+    size = disturbance.shape[0]
+    slopes = steady.slopes[steady.corners]
+    scales = _scales(slopes.mean(axis=0)[:, :size], disturbance)
+    # In these units all states and controls are of about 1.
+    A = slopes[:, :, :size] * scales / scales[:, None]
+    B = slopes[:, :, size:] * half_ranges / scales[:, None]
+    W = disturbance / scales / scales[:, None]
+    X = cp.Variable((size, size), symmetric=True)
+    effort = 0.0
+    conditions = []
+    Ys = []
+    for A_i, B_i in zip(A, B, strict=True):
+        Y = cp.Variable((len(half_ranges), size))
+        Z = cp.Variable((len(half_ranges), len(half_ranges)), symmetric=True)
+        closed = A_i @ X - B_i @ Y
+        conditions += [
+            cp.bmat([[rate**2 * X, closed.T], [closed, X]]) >> 0,
+            cp.bmat([[X - W, closed], [closed.T, X]]) >> 0,
+            cp.bmat([[Z, Y], [Y.T, X]]) >> 0,
+        ]
+        effort = effort + cp.trace(Z) / len(A)
+        Ys.append(Y)
+    problem = cp.Problem(cp.Minimize(effort), conditions)
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.SolverError:
+        return None
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        return None
+    inverse = np.linalg.inv(np.asarray(X.value))
+    gains = [half_ranges[:, None] * (Y.value @ inverse) / scales for Y in Ys]
+    return np.stack(gains)
+
+
+def _scales(A: np.ndarray, disturbance: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of ξ after a few steps of disturbances."""
+    covariance = np.zeros_like(disturbance)
+    for _ in range(GROWTH_STEPS):
+        covariance = A @ covariance @ A.T + disturbance
+    return np.sqrt(np.maximum(np.diag(covariance), 1e-12))
+
+
+def _interpolated_inside(steady: SteadyStates, gains: np.ndarray) -> np.ndarray:
+    """Return gains at all points of a table from those at its corners."""
+    axes = len(steady.low)
+    values = gains.reshape(*(2,) * axes, *gains.shape[1:])
+    shares = np.linspace(0.0, 1.0, steady.points)
+    for axis in range(axes):
+        first, last = np.moveaxis(values, axis, 0)
+        along = np.multiply.outer(1.0 - shares, first) + np.multiply.outer(shares, last)
+        values = np.moveaxis(along, 0, axis)
+    return values.reshape(-1, *gains.shape[1:])
