@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -207,8 +207,19 @@ def load(
     if is_system(path):
         if controller or latency or adaptive or signed_by or env_source != "measured":
             raise ValueError(f"{path} is the policy of a system: load it by path alone")
-        policy_of_system: Any = load_system(path)
-        return policy_of_system
+        return cast(Any, load_system(path))
+    return _load_vehicle(path, controller, env_source, adaptive, latency, signed_by)
+
+
+def _load_vehicle(
+    path: str | Path,
+    controller: Mapping[str, Any] | None,
+    env_source: str,
+    adaptive: bool,
+    latency: Latency | None,
+    signed_by: str | Path | None,
+) -> Policy:
+    """Return the policy of a vehicle; see `load`."""
     file = policy_file(path)
     trained = restore(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
@@ -249,8 +260,8 @@ def load(
     if certificate is not None:
         signature = describe_signature(certificate.sha256, certificate.signature)
     else:
-        # 3: `policy_numerics` stands between this function and its caller.
-        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
+        # 4: `load` and `policy_numerics` stand between this function and the caller.
+        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=4)
     return Policy(
         **vars(replace(trained, settings=_stating(settings, latency))),
         controller=_entrance(planner, trained),
