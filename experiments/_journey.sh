@@ -1,18 +1,18 @@
 # The journey from a simulator to its corridor (docs/your-vehicle.md): train, certify, drive beside its rivals, and
 # print one line of JSON. simulator.sh and slipx.sh source it with their arguments, after they have set
 #
-#     name     of the runs
-#     seconds  of an episode, in full size and with --small
-#     vehicle  words of the vehicle and of its environment
-#     policy   words of what is learned, and of its planner
-#     laws     systems without a planner that drive beside it
-#     estimated  words of a policy that estimates its environment; none, and it is not driven
+#     name       of the runs
+#     seconds    of a run, in full size and with --small
+#     vehicle    words of the vehicle and of its environment
+#     policy     words of what is learned
+#     laws       systems without a planner that drive beside it
+#     estimated  words with which the policy estimates its environment; without any it does not
 set -euo pipefail
 export PYTHONPATH=${PYTHONPATH:-src}:.:examples
 root=runs
 size=(
   dataset.segments=4000 training.steps=6000
-  certification.corridor.runs=150 certification.corridor.attack_steps=20000
+  certification.corridor.runs=150 "certification.corridor.duration=${seconds[0]}" certification.corridor.attack_steps=20000
   evaluation.episodes=40 "evaluation.episode_s=${seconds[0]}"
 )
 if [ "${1:-}" = --small ]; then

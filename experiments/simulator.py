@@ -47,6 +47,9 @@ def main():
             name = "estimated_" if estimated else ROWS.get(row["system"], "")
             found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
             found[f"{name}departures"] = row["departures"]
+            # There is none of runs that are not finite.
+            if row["max_deviation_m"] is not None:
+                found[f"{name}worst_m"] = row["max_deviation_m"]
     rounded = {name: np.round(value, 3).tolist() for name, value in found.items()}
     law = {"law": corridor.conditions.law_model}
     print(json.dumps(law | rounded | stamp()))
