@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks import PRETRAINED, ROOT, is_old
 from benchmarks.tables import Measured, measured, table
 from experiments import results
-from experiments.simulator import PREFIXES, ROWS
+from experiments.simulator import LAW, PREFIXES
 from sfkd_jax import certificate, store
 from sfkd_jax.driving.certificate import DrivingCertificate
 
@@ -120,7 +120,7 @@ RIVALS = {
     "law": "the law alone",
 }
 """Row of corridor.json -> who drives, on the first page."""
-SAME_ROW = {"sfkd": "", "law": ROWS["law_learned"]} | PREFIXES
+SAME_ROW = {"sfkd": "", "law": LAW} | PREFIXES
 """Row of corridor.json -> prefix of the same in the line of a car of `FOREIGN`."""
 FOREIGN = {"highway-env": "simulator", "slipx, 1/10": "slipx"}
 """Cars that nobody here wrote -> file of their line."""

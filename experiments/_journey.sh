@@ -5,7 +5,6 @@
 #     seconds    of a run, in full size and with --small
 #     vehicle    words of the vehicle and of its environment
 #     policy     words of what is learned
-#     laws       systems without a planner that drive beside it
 #     estimated  words with which the policy estimates its environment; without any it does not
 set -euo pipefail
 export PYTHONPATH=${PYTHONPATH:-src}:.:examples
@@ -32,6 +31,11 @@ python -m sfkd_jax.train "${path[@]}" 'evaluation.systems=[self]' "$@"
 if [ ${#estimated[@]} -gt 0 ]; then
   python -m sfkd_jax.evaluate "${path[@]}" 'evaluation.systems=[self]' "${estimated[@]}" "$@"
 fi
-python -m sfkd_jax.evaluate "${path[@]}" controller.mppi.num_samples=1 "evaluation.systems=[$laws]" "$@"
+# With one sample a law drives alone. Beside another law than its own the model is the simulator itself, which rolls out
+# every plan, so that the horizon is short.
+alone=("${path[@]}" controller.mppi.num_samples=1)
+python -m sfkd_jax.evaluate "${alone[@]}" 'evaluation.systems=[self]' "$@"
+python -m sfkd_jax.evaluate "${alone[@]}" controller.mppi.horizon=3 \
+  'evaluation.systems=[law_stanley,law_pure_pursuit]' "$@"
 python -m sfkd_jax.evaluate +experiment=s3_body name="${name}_nominal" "${car[@]}" 'evaluation.systems=[nominal]' "$@"
 python -m experiments.simulator "$root" "$name"

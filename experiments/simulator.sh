@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # From a simulator that nobody here wrote to a car in its corridor (docs/your-vehicle.md). The simulator is the
 # dynamic bicycle of highway-env (examples/highway.py), whose grip and side force switch. Beside the policy, the
-# same policy drives with grip and force estimated, and so do MPPI with the textbook bicycle, Stanley's law and
-# pure pursuit, whose constants are chosen on this car. The last line of the output is the line of simulator.json.
+# same policy drives with grip and force estimated, and so do its law alone, MPPI with the textbook bicycle, Stanley's
+# law and pure pursuit, whose constants are chosen on this car. The last line of the output is the line of simulator.json.
 #
 #     bash experiments/simulator.sh [--small] [root=DIR and other Hydra overrides]
 name=highway
@@ -13,7 +13,6 @@ policy=(
   # The settings with which the line of simulator.json was made.
   dataset.law.lateral=10 dataset.law.heading=60 'training.loss.tube=[0.05]'
 )
-laws=law_stanley,law_pure_pursuit
 # A force acts as it is (power 1), a wind by its square. The model's errors are those of open_loop.json.
 estimated=(
   environment.source=estimated controller.adaptation.power=1

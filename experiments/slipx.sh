@@ -9,6 +9,5 @@ name=slipx
 seconds=(30 20)
 vehicle=(vehicle.env=slipx_car:make 'environment.low=[0.5,-3]' 'environment.high=[1.1,3]')
 policy=('dataset.law.points=[13,5,5]' 'latency.sensors=[0.05]')
-laws=law_learned,law_stanley,law_pure_pursuit
 estimated=()
 . "$(dirname "$0")/_journey.sh"
