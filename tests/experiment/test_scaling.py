@@ -100,7 +100,8 @@ def test_a_car_at_a_tenth_a_truck_and_a_robot_stay_within_their_limits(
         f"vehicle.control_high={high}".replace(" ", ""),
     )
     dataset = f"dataset.speed={list(speed)}".replace(" ", "")
-    drives = own(wheelbase, dataset, limits=words).dataset
+    chosen = own(wheelbase, dataset, limits=words)
+    drives = chosen.dataset
     law = drives.law
     tightest = np.tan(high[0]) / wheelbase
     assert drives.peak_curvature <= tightest / 3
@@ -112,6 +113,9 @@ def test_a_car_at_a_tenth_a_truck_and_a_robot_stay_within_their_limits(
         law.lateral_acceleration / drives.lateral_acceleration, 1.1, rtol=0.02
     )
     assert drives.lateral_acceleration <= 2.0
+    # S3 asks for no more than the class has.
+    roads = chosen.scenario
+    assert roads.speed**2 * roads.peak_curvature <= 1.01 * drives.lateral_acceleration
     # The roads use the curvature that they may have, at some of the speeds.
     assert drives.lateral_acceleration / speed[0] ** 2 >= drives.peak_curvature
 

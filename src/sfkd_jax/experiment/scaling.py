@@ -57,6 +57,14 @@ class Scale(NamedTuple):
         return self.curvature / self.length
 
     @property
+    def scenario_curvature(self) -> float:
+        """Of the roads of S3, which a car drives at its largest lateral acceleration.
+
+        No road asks for more than the class has.
+        """
+        return min(self.curvature, self.acceleration / self.speed**2)
+
+    @property
     def lateral_jerk(self) -> float:
         """Of v³ dκ/ds, the rate of the lateral acceleration."""
         return self.acceleration * self.speed / self.length
@@ -110,7 +118,7 @@ SCALED = {
     "dataset.law.drive": _OF_DRIVE,
     "training.loss.size": Scaled("-", lambda scale: scale.length),
     "scenario.speed": _SPEED,
-    "scenario.peak_curvature": _CURVATURE,
+    "scenario.peak_curvature": Scaled("1/m", lambda scale: scale.scenario_curvature),
     "scenario.wavelengths": _LENGTH,
     "controller.cost.lateral": _OF_DISTANCE,
     "controller.cost.speed": _OF_SPEED,
