@@ -263,7 +263,7 @@ def _simulated(
     steps: int,
     dwell: Span,
     law: Law,
-    keys: Key,
+    keys: Array,
     spread: Float[Array, " state"],
     noise: Float[Array, " state"],
 ) -> Trajectory:
