@@ -154,6 +154,7 @@ def test_a_system_may_be_undefined_outside_the_range_of_its_reference():
         ({"reference": {("x",): (-1.0, 1.0), ("v",): (-1.0, 1.0)}}, "held"),
         ({"ranges": {"w": (-1.0, 1.0)}}, "ranges: w"),
         ({"ranges": {"v": (1.0, -1.0)}}, "ranges: v"),
+        ({"ranges": {"x": (-1.0, 1.0), "v": (2.0, 3.0)}}, "ranges: x cannot stay"),
         ({"dwell": (2.0, 1.0)}, "dwell"),
         ({"dwell": (0.0, 1.0)}, "dwell"),
         ({"dwell": (1.0, np.inf)}, "dwell"),

@@ -84,6 +84,13 @@ class Tracking:
             if state not in listed:
                 raise ValueError(f"ranges: {state} is in no chain of the reference")
             check_ends(f"ranges: {state}", ends)
+        for chain in self.reference:
+            ends = self.ranges.get(chain[-1], (-1.0, 1.0))
+            if chain[0] in self.ranges and len(chain) == 2 and ends[0] * ends[1] >= 0.0:
+                raise ValueError(
+                    f"ranges: {chain[0]} cannot stay in its range, since that of "
+                    f"{chain[1]} has no 0 inside"
+                )
         _check_dwell(self.dwell)
 
     @property
