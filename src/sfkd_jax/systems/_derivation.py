@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -207,7 +205,7 @@ def _solution(
             cp.bmat([[X - W, closed], [closed.T, X]]) >> 0,
         ]
     effort = sum(cp.trace(Z) for Z in Zs) / corners
-    problem = cp.Problem(cp.Minimize(effort), conditions)
+    problem = cp.Problem(cp.Minimize(effort), [*conditions])
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.SolverError:
