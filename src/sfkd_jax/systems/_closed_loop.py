@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.systems._law import Law, SteadyState
@@ -29,7 +30,7 @@ class ClosedLoop:
         """Number of entries of ν."""
         return len(self.tracked.system.controls)
 
-    def split(self, control: Control) -> tuple[Control, Inputs]:
+    def split(self, control: Float[Array, " nu_and_inputs"]) -> tuple[Control, Inputs]:
         """Return ν and ρ of a control of the model."""
         return control[: self.controls], control[self.controls :]
 
@@ -48,7 +49,12 @@ class ClosedLoop:
         """
         return self.limited(steady.feedback(measured) + nu)
 
-    def step(self, state: State, control: Control, env: Environment) -> State:
+    def step(
+        self,
+        state: State,
+        control: Float[Array, " nu_and_inputs"],
+        env: Environment,
+    ) -> State:
         """Return the state of a model one sampling period later; see `types.Step`."""
         error = state[BODY]
         nu, inputs = self.split(control)

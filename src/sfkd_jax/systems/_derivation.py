@@ -21,6 +21,12 @@ GROWTH_STEPS = 10
 """
 RATES = (0.7, 0.75, 0.8, 0.83, 0.86, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 """Rates that are tried, fastest first."""
+ROUNDS = 8
+"""Number of times that conditions are added inside the table."""
+ADDED = 4
+"""Number of points of the table that are added at a time."""
+UNREACHED = 1e-9
+"""Effect of a control that is none."""
 SATURATED = 0.01
 """Largest share of steps in which a control is at its limit."""
 TRIAL_STEPS = 300
@@ -85,7 +91,8 @@ def derive_law(
     One metric X⁻¹ serves all corners i of the table: what switches between them
     contracts as well, and so can a model with one certificate for all of them. X is a
     bound of the covariance of ξ under the disturbances W: changes of the steady state,
-    ν and noise. Gains inside the table are interpolated.
+    ν and noise. Gains inside the table are interpolated, and so are Y_i. Points of the
+    table where the loop does not contract in this metric are added to the conditions.
 
     Args:
         tracked: the system.
@@ -106,9 +113,8 @@ def derive_law(
     if gains is None:
         raise NoLaw(
             f"no gains contract {', '.join(tracked.names)} at a rate of {rate:g} in "
-            "one metric for all references and e"
+            f"one metric for all references and e{_unreachable(tracked, steady, rate)}"
         )
-    gains = _interpolated_inside(steady, gains)
 
     def table(values: np.ndarray) -> Array:
         shape = (*steady.counts, *values.shape[1:])
@@ -145,41 +151,95 @@ def _disturbance(
 def _contracting_gains(
     steady: SteadyStates, disturbance: np.ndarray, half_ranges: np.ndarray, rate: float
 ) -> np.ndarray | None:
-    """Return the gains at the corners of the table, see `derive_law`; None if none."""
+    """Return the gains at all points of the table, see `derive_law`; None if none."""
+    size = disturbance.shape[0]
+    scales = _scales(steady.slopes[steady.corners].mean(axis=0)[:, :size], disturbance)
+    # In these units all states and controls are of about 1.
+    A = steady.slopes[:, :, :size] * scales / scales[:, None]
+    B = steady.slopes[:, :, size:] * half_ranges / scales[:, None]
+    W = disturbance / scales / scales[:, None]
+    # Of all points: the shares of the corners, with which gains are interpolated.
+    shares = _interpolated_inside(steady, np.eye(len(steady.corners)))
+    places = list(steady.corners)
+    for _ in range(ROUNDS):
+        solution = _solution(A[places], B[places], W, shares[places], rate)
+        if solution is None:
+            return None
+        X, at_corners = solution
+        gains = np.tensordot(shares, at_corners, 1)
+        rates = _rates_in(X, A - B @ gains)
+        worst = np.argsort(rates)[-ADDED:]
+        expanding = worst[rates[worst] >= 1.0]
+        if len(expanding) == 0:
+            return half_ranges[:, None] * gains / scales
+        places.extend(expanding)
+    return None
+
+
+def _solution(
+    A: np.ndarray, B: np.ndarray, W: np.ndarray, shares: np.ndarray, rate: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return X and the gains at the corners of the table, from conditions at places.
+
+    Args:
+        A: of the places, the corners first.
+        B: of the places.
+        W: covariance of the disturbances.
+        shares: of the corners in the gains of the places.
+        rate: α.
+    """
     import cvxpy as cp
 
-    size = disturbance.shape[0]
-    slopes = steady.slopes[steady.corners]
-    scales = _scales(slopes.mean(axis=0)[:, :size], disturbance)
-    # In these units all states and controls are of about 1.
-    A = slopes[:, :, :size] * scales / scales[:, None]
-    B = slopes[:, :, size:] * half_ranges / scales[:, None]
-    W = disturbance / scales / scales[:, None]
+    size, controls = B.shape[1:]
+    corners = shares.shape[1]
     X = cp.Variable((size, size), symmetric=True)
-    effort = 0.0
-    conditions = []
-    Ys = []
-    for A_i, B_i in zip(A, B, strict=True):
-        Y = cp.Variable((len(half_ranges), size))
-        Z = cp.Variable((len(half_ranges), len(half_ranges)), symmetric=True)
+    Ys = [cp.Variable((controls, size)) for _ in range(corners)]
+    Zs = [cp.Variable((controls, controls), symmetric=True) for _ in range(corners)]
+    conditions = [cp.bmat([[Z, Y], [Y.T, X]]) >> 0 for Z, Y in zip(Zs, Ys, strict=True)]
+    for A_i, B_i, of_corners in zip(A, B, shares, strict=True):
+        used = np.flatnonzero(of_corners)
+        Y = sum(of_corners[index] * Ys[index] for index in used)
         closed = A_i @ X - B_i @ Y
         conditions += [
             cp.bmat([[rate**2 * X, closed.T], [closed, X]]) >> 0,
             cp.bmat([[X - W, closed], [closed.T, X]]) >> 0,
-            cp.bmat([[Z, Y], [Y.T, X]]) >> 0,
         ]
-        effort = effort + cp.trace(Z) / len(A)
-        Ys.append(Y)
-    problem = cp.Problem(cp.Minimize(effort), conditions)
+    effort = sum(cp.trace(Z) for Z in Zs) / corners
+    problem = cp.Problem(cp.Minimize(effort), [*conditions])
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.SolverError:
         return None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         return None
-    inverse = np.linalg.inv(np.asarray(X.value))
-    gains = [half_ranges[:, None] * (Y.value @ inverse) / scales for Y in Ys]
-    return np.stack(gains)
+    covariance = np.asarray(X.value)
+    metric = np.linalg.inv(covariance)
+    return covariance, np.stack([np.asarray(Y.value) @ metric for Y in Ys])
+
+
+def _rates_in(X: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Return the rates at which closed loops contract in the metric X⁻¹."""
+    values, vectors = np.linalg.eigh(X)
+    # Rounding may leave an eigenvalue at 0, where nothing contracts.
+    root = np.sqrt(np.maximum(values, 1e-12))
+    turned = vectors.T @ closed @ vectors
+    return np.linalg.norm(turned * root / root[:, None], ord=2, axis=(1, 2))
+
+
+def _unreachable(tracked: Tracked, steady: SteadyStates, rate: float) -> str:
+    """Return which states no control makes contract, as part of a message.
+
+    A left eigenvector w of A with an eigenvalue above the rate and w B = 0 says so.
+    """
+    size = len(tracked.names)
+    for index in steady.corners:
+        A, B = np.split(steady.slopes[index], [size], axis=1)
+        values, vectors = np.linalg.eig(A.T)
+        for value, mode in zip(values, vectors.T, strict=True):
+            if abs(value) > rate and np.abs(mode @ B).max() <= UNREACHED:
+                state = tracked.names[int(np.argmax(np.abs(mode)))]
+                return f": no control acts on {state}, which changes by itself"
+    return ""
 
 
 def _scales(A: np.ndarray, disturbance: np.ndarray) -> np.ndarray:

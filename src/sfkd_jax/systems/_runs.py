@@ -91,7 +91,11 @@ def random_reference(tracked: Tracked, key: Key, *, steps: int) -> Reference:
         return after, (after, rates)
 
     start = jnp.zeros(len(tracked.chained))
+    # A chain that moves between places begins at rest, or it could leave its range.
+    at_rest = {chain[1:] for chain in frame.reference if chain[0] in frame.ranges}
     for state, ends in frame.ranges.items():
+        if (state,) in at_rest:
+            continue
         index = frame.chained.index(state)
         draw = within(ends, jax.random.fold_in(start_key, index))
         start = start.at[index].set(draw)
@@ -124,10 +128,14 @@ def _profile(tracked: Tracked, chain: tuple[str, ...]) -> Profile:
     braking = BRAKING * min(-slowest, fastest)
 
     def towards(first: Scalar, last: Scalar, goal: Scalar) -> Scalar:
-        way = goal - first
-        # The rate from which it still stops at the goal.
-        rate = jnp.minimum(jnp.sqrt(2.0 * braking * jnp.abs(way)), jnp.abs(way) / dt)
-        return limited(last, (jnp.sign(way) * rate - last) / dt)
+        side = jnp.sign(goal - first)
+        # The rate v' from which it still stops at the goal, a step later:
+        # (v + v') dt / 2 + v'² / (2 b) = way.
+        half = 0.5 * braking * dt
+        squared = half**2 + 2.0 * braking * jnp.abs(goal - first)
+        squared = squared - 2.0 * half * side * last
+        rate = jnp.sqrt(jnp.maximum(squared, 0.0)) - half
+        return limited(last, (side * rate - last) / dt)
 
     return towards
 
@@ -263,7 +271,7 @@ def _simulated(
     steps: int,
     dwell: Span,
     law: Law,
-    keys: Key,
+    keys: Array,
     spread: Float[Array, " state"],
     noise: Float[Array, " state"],
 ) -> Trajectory:

@@ -75,6 +75,7 @@ class _Compared(NamedTuple):
         running: whether there is a nominal model.
         distance: |y − ŷ| of each output; NaN without a comparison.
         exceeded: whether a distance is larger than what is certified.
+        kept: whether |ŷ| is within its bound now.
     """
 
     error: Error
@@ -83,6 +84,7 @@ class _Compared(NamedTuple):
     running: Bool[Array, ""]
     distance: Float[Array, " output"]
     exceeded: Bool[Array, ""]
+    kept: Bool[Array, ""]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +168,8 @@ class Shield(Stateful):
         outside = self._outside(compared.error, known[0]) | jnp.any(inside != known_env)
         law_control = self.loop.limited(steady.feedback(compared.error))
         usable = all_finite(planned) & info.plan.healthy & ~outside
-        request = jnp.where(usable, self.loop.limited(planned) - law_control, 0.0)
+        planned = self.loop.limited(planned)
+        request = jnp.where(usable, planned - law_control, 0.0)
         limit = self.loop.law.perturbation
         ahead = known[jnp.minimum(jnp.arange(self.horizon), known.shape[0] - 1)]
         passed = safety_filter(
@@ -191,7 +194,7 @@ class Shield(Stateful):
             (~compared.running, Reason.NOT_STARTED),
             (outside, Reason.OUTSIDE_BOX),
             (compared.exceeded, Reason.BOUND_EXCEEDED),
-            (~passed.feasible, Reason.INFEASIBLE),
+            (~passed.feasible | ~compared.kept, Reason.INFEASIBLE),
         )
         after = self._after(params, compared, control, steady, known[0], reason)
         latent = self.model.decode(compared.fiber, compared.latent)[BODY]
@@ -247,13 +250,18 @@ class Shield(Stateful):
         exceeded = compared & ~jnp.all(distance <= allowed)
         starts = (~state.started & measured) | exceeded
         anchor = model.encode(fiber, without_pose(complete))
+        now = jax.tree.map(partial(jnp.where, starts), anchor, latent)
+        state_now = model.decode(fiber, now)[BODY]
+        sizes = jnp.stack([size_of(state_now, rows) for rows in self._rows])
+        widths = jnp.asarray([bound.nominal for bound in self.bounds.values()])
         return _Compared(
             error=complete,
-            latent=jax.tree.map(partial(jnp.where, starts), anchor, latent),
+            latent=now,
             fiber=fiber,
             running=state.started | starts,
             distance=jnp.where(compared, distance, jnp.nan),
             exceeded=exceeded,
+            kept=jnp.all(sizes <= (1.0 + ROUNDING) * widths),
         )
 
     def _outside(self, error: Error, inputs: Inputs) -> Bool[Array, ""]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -121,8 +121,8 @@ def _steady_states(
         after = tracked.step(error, both[size:], place[:count], place[count:])
         return after - error
 
-    def corrected(place: Array) -> Callable[[int, Array], Array]:
-        def newton(_: int, unknown: Array) -> Array:
+    def corrected(place: Array) -> Callable[[Any, Array], Array]:
+        def newton(_: Any, unknown: Array) -> Array:
             slopes = jax.jacfwd(residual)(unknown, place)
             return unknown - jnp.linalg.solve(slopes, residual(unknown, place))
 
@@ -158,7 +158,7 @@ def _require_settled(
         held = ", ".join(tracked.names[i] for i in tracked.held)
         raise NoLaw(
             f"with {held} held there is no steady state at {missing.sum()} of "
-            f"{len(places)} places, as at {_described(tracked, places[missing][0])}: "
+            f"{len(places)} places, as at {described(tracked, places[missing][0])}: "
             "hold other states, or make the ranges smaller"
         )
 
@@ -180,7 +180,7 @@ def _require_within_limits(
         raise NoLaw(
             f"saturation: at {beyond.sum()} of {len(places)} places the reference asks "
             f"for more than the limits, as at "
-            f"{_described(tracked, places[beyond][0])}: {listed}"
+            f"{described(tracked, places[beyond][0])}: {listed}"
         )
 
 
@@ -199,7 +199,7 @@ def _slopes(
     return jax.jit(jax.vmap(slopes))(*map(jnp.asarray, (states, controls, places)))
 
 
-def _described(tracked: Tracked, place: np.ndarray) -> str:
+def described(tracked: Tracked, place: np.ndarray) -> str:
     """Return a place (ρ, e) in words."""
     names = [*tracked.frame.input_names, *tracked.system.environment]
     return ", ".join(

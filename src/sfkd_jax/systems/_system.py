@@ -20,7 +20,7 @@ from sfkd_jax.variables import ControlVariable, EnvironmentVariable, StateVariab
 
 Ends = tuple[float, float]
 """Lower and upper end of a range."""
-_LABEL = re.compile(r"\s*(?P<name>[^\[\]]+?)\s*(?:\[(?P<unit>[^\[\]]*)\])?\s*")
+_LABEL = re.compile(r"\s*(?P<name>[^\[\]\s][^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?\s*")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,10 @@ class System:
         for what in ("states", "controls", "environment"):
             _check_names(what, getattr(self, what))
         for name, deviation in self.states.items():
-            if not 0.0 <= deviation < np.inf:
+            if not (_is_number(deviation) and deviation >= 0.0):
                 raise ValueError(
                     f"states: the deviation of {name} must be 0 or above, "
-                    f"got {deviation}"
+                    f"got {deviation!r}"
                 )
         for what in ("controls", "environment"):
             for name, ends in getattr(self, what).items():
@@ -157,7 +157,7 @@ def integrated(
 
 def split_label(label: str) -> tuple[str, str]:
     """Return name and unit of a label such as "roll [rad]"; the unit may be ""."""
-    match = _LABEL.fullmatch(label)
+    match = _LABEL.fullmatch(str(label))
     if match is None:
         raise ValueError(f'a name looks like "roll" or "roll [rad]", got {label!r}')
     return match["name"], match["unit"] or ""
@@ -166,12 +166,19 @@ def split_label(label: str) -> tuple[str, str]:
 def check_ends(what: str, ends: Any) -> None:
     """Raise a ValueError unless a range is two finite, rising numbers."""
     is_pair = isinstance(ends, tuple | list) and len(ends) == 2
-    if not (is_pair and np.isfinite(ends).all() and ends[0] < ends[1]):
+    if not (is_pair and all(map(_is_number, ends)) and ends[0] < ends[1]):
         raise ValueError(f"{what}: a range is two rising numbers, got {ends!r}")
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a finite number."""
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
 
 
 def _check_names(what: str, entries: Mapping[str, Any]) -> None:
     """Raise a ValueError unless there are names, each of them once."""
+    if not isinstance(entries, Mapping):
+        raise ValueError(f"{what}: names with a value each, got {entries!r}")
     names = [split_label(label)[0] for label in entries]
     if not names:
         raise ValueError(f"{what}: a system needs one at least")

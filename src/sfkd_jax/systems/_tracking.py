@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,10 @@ Error: TypeAlias = Float[Array, " state"]
 """ξ: the state less that of the reference, where the reference has it."""
 INVARIANCE = 1e-3
 """Largest change of a step by what should not matter, relative to the step."""
-
+PLACES = 8
+"""Number of places at which the invariance is tried."""
+ROUNDING = 1e-9
+"""Change of a step that is none."""
 LENGTH = 0.1
 """What half the width of an entry of ξ counts in a training loss, in place of metres.
 """
@@ -64,6 +67,10 @@ class Tracking:
     def __post_init__(self) -> None:
         if not self.outputs or not self.reference:
             raise ValueError("a frame needs an output and a reference")
+        for name, states in self.outputs.items():
+            _check_states(f"outputs: {name}", states)
+        for chain in self.reference:
+            _check_states("reference: a chain", chain)
         listed = [state for chain in self.reference for state in chain]
         if len(set(listed)) < len(listed):
             raise ValueError(f"reference: a state is in two chains: {listed}")
@@ -77,8 +84,14 @@ class Tracking:
             if state not in listed:
                 raise ValueError(f"ranges: {state} is in no chain of the reference")
             check_ends(f"ranges: {state}", ends)
-        if not 0.0 < self.dwell[0] <= self.dwell[1]:
-            raise ValueError(f"dwell: two rising times above 0, got {self.dwell}")
+        for chain in self.reference:
+            ends = self.ranges.get(chain[-1], (-1.0, 1.0))
+            if chain[0] in self.ranges and len(chain) == 2 and ends[0] * ends[1] >= 0.0:
+                raise ValueError(
+                    f"ranges: {chain[0]} cannot stay in its range, since that of "
+                    f"{chain[1]} has no 0 inside"
+                )
+        _check_dwell(self.dwell)
 
     @property
     def chained(self) -> tuple[str, ...]:
@@ -174,8 +187,11 @@ class Tracked:
         if len(self.held) != len(self.system.controls):
             raise ValueError(
                 f"held: as many states as there are controls "
-                f"({len(self.system.controls)}), got {[*frame.held] or 'none'}"
+                f"({len(self.system.controls)}), got "
+                f"{', '.join(self.names[index] for index in self.held)}"
             )
+        if len(set(self.held)) < len(self.held):
+            raise ValueError(f"held: each state once, got {', '.join(frame.held)}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -277,7 +293,11 @@ class Tracked:
     ) -> Float[Array, "gap chain"]:
         """Return the rates of the chains between the points of a reference."""
         last = np.cumsum([len(chain) for chain in self.frame.reference]) - 1
-        return jnp.diff(reference[:, last], axis=0) / self.system.dt
+        variables = self.system.state_variables
+        wraps = [variables[self.chained[index]].is_angle for index in last]
+        change = jnp.diff(reference[:, last], axis=0)
+        # The angles of a reference may be wrapped.
+        return jnp.where(np.asarray(wraps), wrap_angle(change), change) / self.system.dt
 
     def check_invariance(self, key: Key) -> None:
         """Raise a ValueError if the system depends on a state of the reference.
@@ -285,32 +305,41 @@ class Tracked:
         Args:
             key: of the places at which it is tried; consumed.
         """
-        system = self.system
-        low, high = map(jnp.asarray, system.control_box)
-        envs = jnp.asarray(system.env_box)
-        control = jnp.clip(jnp.zeros(len(low)), low, high)
-        env = jnp.mean(envs, axis=0)
-        size = len(self.chained)
-        rates = jnp.zeros(len(self.frame.reference))
 
-        def moved(error: Error, reference: ReferenceState) -> Error:
-            after = system.step(self.state(error, reference), control, env)
-            return self.coordinates(after, self.advance(reference, rates)) - error
+        def moved(place: _Place, reference: ReferenceState) -> Error:
+            state = self.state(place.error, reference)
+            after = self.system.step(state, place.control, place.env)
+            rates = jnp.zeros(len(self.frame.reference))
+            return self.coordinates(after, self.advance(reference, rates)) - place.error
 
-        errors = 0.1 * jax.random.normal(key, (8, len(self.names)))
-        start = jax.vmap(moved, in_axes=(0, None))(errors, jnp.zeros(size))
-        scale = jnp.max(jnp.abs(start))
-        for index, state in enumerate(self.frame.chained):
-            if state in self.frame.ranges:
-                continue
-            beside = jnp.zeros(size).at[index].set(1.0)
-            change = jax.vmap(moved, in_axes=(0, None))(errors, beside) - start
-            if not np.max(np.abs(change)) <= INVARIANCE * scale:
-                raise ValueError(
-                    f"the system behaves differently where {state} of the reference is "
-                    f"another: give the range of the reference, as in "
-                    f'ranges={{"{state}": (-1.0, 1.0)}}'
-                )
+        # In float64: a difference may be small beside the states that are subtracted.
+        with jax.enable_x64(True):
+            inputs = jnp.mean(jnp.asarray(self.frame.input_box), axis=0)
+            middle = self._reference_of(inputs)
+            places = jax.vmap(self._place)(jax.random.split(key, PLACES))
+            along = jax.jit(jax.vmap(moved, in_axes=(0, None)))
+            start = along(places, middle)
+            scale = jnp.max(jnp.abs(start), axis=0)
+            for index, state in enumerate(self.frame.chained):
+                if state in self.frame.ranges:
+                    continue
+                beside = middle.at[index].add(1.0)
+                change = jnp.max(jnp.abs(along(places, beside) - start), axis=0)
+                if not np.all(change <= INVARIANCE * scale + ROUNDING):
+                    raise ValueError(
+                        f"the system behaves differently where {state} of the "
+                        "reference is another: give the range of the reference, as in "
+                        f'ranges={{"{state}": (-1.0, 1.0)}}'
+                    )
+
+    def _place(self, key: Key) -> _Place:
+        """Draw a place at which the invariance is tried."""
+        error_key, control_key, env_key = jax.random.split(key, 3)
+        return _Place(
+            error=0.1 * jax.random.normal(error_key, (len(self.names),)),
+            control=_drawn(control_key, self.system.control_box),
+            env=_drawn(env_key, self.system.env_box),
+        )
 
     def _whole(self, reference: ReferenceState) -> State:
         """Return a state that is that of the reference, and 0 elsewhere."""
@@ -327,3 +356,37 @@ class Tracked:
             for state in frame.chained
         ]
         return jnp.stack(entries)
+
+
+class _Place(NamedTuple):
+    """Where a step is tried.
+
+    Attributes:
+        error: ξ.
+        control: u.
+        env: e.
+    """
+
+    error: Error
+    control: Control
+    env: Environment
+
+
+def _drawn(key: Key, box: tuple[tuple[float, ...], tuple[float, ...]]) -> Array:
+    """Draw a point of a box."""
+    low, high = map(jnp.asarray, box)
+    return jax.random.uniform(key, low.shape, minval=low, maxval=high)
+
+
+def _check_states(what: str, states: Any) -> None:
+    """Raise a ValueError unless these are names of states, in a tuple."""
+    is_sequence = isinstance(states, tuple | list) and len(states) > 0
+    if not (is_sequence and all(isinstance(state, str) for state in states)):
+        raise ValueError(f'{what} is states as in ("x", "y"), got {states!r}')
+
+
+def _check_dwell(dwell: Any) -> None:
+    """Raise a ValueError unless these are two times, the shorter first."""
+    is_pair = isinstance(dwell, tuple | list) and len(dwell) == 2
+    if not (is_pair and 0.0 < dwell[0] <= dwell[1] < np.inf):
+        raise ValueError(f"dwell: two rising times above 0, got {dwell!r}")

@@ -122,7 +122,7 @@ def measure_tubes(
 
 
 def _nominal(
-    loop: ClosedLoop, model: Model, params: Params, runs: Trajectory, keys: Key
+    loop: ClosedLoop, model: Model, params: Params, runs: Trajectory, keys: Array
 ) -> tuple[Array, Array]:
     """Return ξ̂ of nominal models that start at measurements, and z_0 − ẑ_0."""
     noise = jnp.asarray(loop.tracked.system.sensor_noise)
