@@ -23,7 +23,6 @@ from sfkd_jax.certification._metric_claims import (
     size_of,
 )
 from sfkd_jax.certification._metrics import (
-    ProvedMetric,
     accepted_metric,
     propose_metric,
 )
@@ -165,7 +164,7 @@ def test_multipliers_that_prove_nothing_do_not_stop_the_search():
     useless = tuple(1e-9 * part for part in weights.residual_multipliers)
     readout = readouts(weights, PATH_FRAME)["position"]
     joint = prove_claims(weights, PATH_FRAME).witnesses.joint
-    start = ProvedMetric(np.eye(readout.shape[1]), joint)
+    start = np.eye(readout.shape[1]), joint
     gaps = worst_gaps(measured())
     bad = weights._replace(residual_multipliers=useless)
     with pytest.raises(CertificationRefused, match="no metric"):

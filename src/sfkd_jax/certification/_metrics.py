@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,8 @@ from sfkd_jax.types import Polytope
 
 TINY = 1e-12
 """Smallest multiplier of a start, whose logarithm the search moves."""
+ProvedMetric: TypeAlias = tuple[Matrix, Sequence[Sequence[Any]]]
+"""A metric, and the multipliers of every vertex that prove contraction in it."""
 MARGIN = 1e-6
 """Relative tightening of constraints, which solvers may violate slightly."""
 SHARES = (0.5, 0.75, 0.9)
@@ -180,13 +182,6 @@ def _in_coordinates(weights: Exported, metric: Matrix) -> Exported:
 
 
 @one_thread()
-class ProvedMetric(NamedTuple):
-    """A metric with the multipliers of every vertex that prove contraction in it."""
-
-    metric: Matrix
-    joint: Sequence[Sequence[Any]]
-
-
 def propose_metric(
     weights: Exported,
     readout: Matrix,
@@ -217,8 +212,8 @@ def propose_metric(
     candidates = []
     usual = [multipliers] * len(vertices)
     for metric, joint in (
-        ProvedMetric(np.eye(rank), usual),
-        *(ProvedMetric(metric, usual) for metric, _ in proved),
+        (np.eye(rank), usual),
+        *((metric, usual) for metric, _ in proved),
     ):
         # Scaled to the trace of I, so that all starts have entries of the same size.
         factor = np.linalg.cholesky(metric * (rank / np.trace(metric)))

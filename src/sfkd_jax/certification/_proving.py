@@ -122,13 +122,13 @@ def _proved_metrics(
     weights: Exported, claims: Claims, lyapunov: LyapunovClaim | None
 ) -> list[ProvedMetric]:
     """Return the metrics in which a step is known to contract."""
-    proved = []
+    proved: list[ProvedMetric] = []
     joint = claims.witnesses.joint
     if claims.alpha_joint < 1.0:
         identity = np.eye(weights.operators.vertices.shape[-1])
-        proved.append(ProvedMetric(identity, joint))
+        proved.append((identity, joint))
     if lyapunov is not None:
-        proved.append(ProvedMetric(np.asarray(lyapunov.metric), lyapunov.joint))
+        proved.append((np.asarray(lyapunov.metric), lyapunov.joint))
     return proved
 
 

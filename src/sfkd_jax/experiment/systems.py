@@ -363,7 +363,7 @@ def train_system(settings: Settings) -> dict[str, Any]:
     make = imported(str(settings.system), "system")
     if not callable(make) or inspect.signature(make).parameters:
         raise ValueError(f"system={settings.system} must be a function of no arguments")
-    made = make()
+    made: Any = make()
     is_pair = isinstance(made, tuple) and len(made) == 2
     if not (is_pair and isinstance(made[0], System) and isinstance(made[1], Tracking)):
         raise ValueError(
