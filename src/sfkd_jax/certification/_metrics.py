@@ -211,10 +211,8 @@ def propose_metric(
     entries = len(lower[0])
     candidates = []
     usual = [multipliers] * len(vertices)
-    for metric, joint in (
-        (np.eye(rank), usual),
-        *((metric, usual) for metric, _ in proved),
-    ):
+    others = [(metric, usual) for metric, _ in proved]
+    for metric, joint in ((np.eye(rank), usual), *others):
         # Scaled to the trace of I, so that all starts have entries of the same size.
         factor = np.linalg.cholesky(metric * (rank / np.trace(metric)))
         candidates.append(np.concatenate([factor[lower], *map(_logs, joint)]))
