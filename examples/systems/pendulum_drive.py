@@ -49,11 +49,11 @@ def make():
         dt=DT,
         states=states,
         controls={"torque [N m]": (-20.0, 20.0)},
-        environment={"load [kg]": (0.2, 1.0), "stiffness [N m]": (40.0, 80.0)},
+        environment={"load [kg]": (0.3, 0.6), "stiffness [N m]": (60.0, 90.0)},
         name="pendulum_drive",
     )
     return system, tracking(
         {"angle": ("angle",)},
-        reference={("angle", "turn"): (-3.0, 3.0)},  # [rad/s²]
-        ranges={"angle": (-1.2, 1.2), "turn": (-1.0, 1.0)},  # [rad], [rad/s]
+        reference={("angle", "turn"): (-2.0, 2.0)},  # [rad/s²]
+        ranges={"angle": (-1.0, 1.0), "turn": (-1.0, 1.0)},  # [rad], [rad/s]
     )
