@@ -83,7 +83,7 @@ def main():
     parser.add_argument("root", type=Path, help="folder of the runs")
     parser.add_argument("names", nargs="*", help=f"of {', '.join(SYSTEMS)}")
     parser.add_argument("--small", action="store_true", help="two systems, small sizes")
-    given = parser.parse_args()
+    given = parser.parse_intermixed_args()
     names = given.names or (SMALL_SYSTEMS if given.small else SYSTEMS)
     if unknown := set(names) - set(SYSTEMS):
         parser.error(f"{', '.join(unknown)}: systems are {', '.join(SYSTEMS)}")
