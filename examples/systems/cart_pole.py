@@ -1,10 +1,10 @@
 """A pole on a cart, upright, with a tip of unknown mass and a length that changes.
 
     p̈ = (F + m sin θ (l θ̇² - g cos θ)) / (M + m sin² θ)
-    θ̈ = ((M + m) g sin θ - cos θ (F + m l θ̇² sin θ)) / (l (M + m sin² θ)) - d θ̇ / (m l²)
+    θ̈ = ((M + m) g sin θ - cos θ (F + m l θ̇² sin θ)) / (l (M + m sin² θ))
 
 The angle θ is 0 where the pole is upright, positive where its tip is ahead. The pole
-has no mass of its own; its joint has the friction d.
+has no mass of its own.
 
 Source: Tedrake, Underactuated Robotics, chapter 3 (cart-pole), with the angle counted
 from upright.
@@ -16,7 +16,6 @@ from sfkd_jax.systems import System, integrated, tracking
 
 DT = 0.04  # sampling period [s]
 CART = 1.0  # mass of the cart [kg]
-FRICTION = 0.02  # of the joint [N m s]
 GRAVITY = 9.81  # [m/s²]
 
 
@@ -34,7 +33,7 @@ def rates(state, control, env):
         speed,
         (force + swing - tip * GRAVITY * sin * cos) / moved,
         turn,
-        spin / (length * moved) - FRICTION * turn / (tip * length**2),
+        spin / (length * moved),
     ]
 
 

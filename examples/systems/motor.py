@@ -3,8 +3,7 @@
     J ω̇ = K i - b ω - τ,   L i̇ = u - R i - K ω
 
 Source of the equations: Franklin, Powell and Emami-Naeini, Feedback Control of Dynamic
-Systems, section 2.3. The constants are those of a servo motor of 200 W at 24 V, with
-the inductance of a choke.
+Systems, section 2.3. The constants are of the size of a servo motor of 200 W at 24 V.
 """
 
 from sfkd_jax.systems import System, integrated, regulation
