@@ -4,7 +4,7 @@
 
 Every system of examples/systems is certified in ROOT/NAME, which is continued where it
 stopped, and then driven beside its law, an oracle and a nominal model. Its line of JSON
-is printed and kept in ROOT/NAME/line.json.
+is printed and kept in ROOT/NAME/line.json, that of --small in small.json.
 """
 
 import argparse
@@ -89,7 +89,7 @@ def main():
         parser.error(f"{', '.join(unknown)}: systems are {', '.join(SYSTEMS)}")
     for name in names:
         directory = given.root / name
-        file = directory / "line.json"
+        file = directory / ("small.json" if given.small else "line.json")
         if not file.is_file():
             line = line_of(
                 name,
