@@ -320,7 +320,7 @@ def certify_system(
     """
     parsed = parse(TubeSettings, settings, "tubes.")
     tracked = Tracked(system, frame)
-    system.check_step()
+    system.check_step(tracked.state(jnp.zeros(len(tracked.names)), tracked.middle))
     tracked.check_invariance(jax.random.key(0))
     run = SystemRun(tracked, parsed, Path(root), seed)
     with store.locked(run.directory):
@@ -337,11 +337,11 @@ def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:
     """Return what the step does at a few places."""
     low, high = map(jnp.asarray, tracked.system.control_box)
     bottom, top = map(jnp.asarray, tracked.system.env_box)
-    size = len(tracked.names)
+    middle = tracked.state(jnp.zeros(len(tracked.names)), tracked.middle)
 
     def probe(key: Key) -> Array:
         state_key, control_key, env_key = jax.random.split(key, 3)
-        state = 0.3 * jax.random.normal(state_key, (size,))
+        state = middle + 0.3 * jax.random.normal(state_key, middle.shape)
         control = jax.random.uniform(control_key, low.shape, minval=low, maxval=high)
         env = jax.random.uniform(env_key, bottom.shape, minval=bottom, maxval=top)
         return tracked.system.step(state, control, env)
