@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,14 @@ from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import fit_planning
 from sfkd_jax.policy import CERTIFICATE, SystemPolicy, TrainedSystem
-from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, Span, check_intervals
+from sfkd_jax.ranges import (
+    AtLeastOne,
+    AtLeastTwo,
+    Fraction,
+    Positive,
+    Span,
+    check_intervals,
+)
 from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.systems import (
     ClosedLoop,
@@ -51,6 +59,8 @@ SMALLEST_PART = 64
 """Smallest number of segments of a part."""
 FIRST_PART = 10
 """Stream of the random keys of the first part."""
+LOGGED = 50
+"""Steps of the training between two lines of its log."""
 SEGMENT = 60
 """Steps of a segment."""
 SPREAD_STEPS = 300
@@ -84,7 +94,7 @@ class TubeSettings:
         perturbation: largest |ν|, relative to half of the range of each control.
         dwell: range of times between two switches of e [s].
         segments: share of the data at full size.
-        steps: optimiser steps of the training.
+        steps: optimiser steps of the training, a multiple of `LOGGED`.
         runs: number of runs of each part that calibrates or tests the tubes.
         duration: of these runs [s].
         level: 1 − δ.
@@ -94,10 +104,10 @@ class TubeSettings:
     """
 
     rate: Fraction | None = None
-    points: AtLeastOne = 5
+    points: AtLeastTwo = 5
     perturbation: Fraction = 0.05
     dwell: Span = (1.0, 4.0)
-    segments: Fraction | float = 1.0
+    segments: Positive = 1.0
     steps: AtLeastOne = 6000
     runs: AtLeastOne = 300
     duration: Positive = 30.0
@@ -215,6 +225,7 @@ class SystemRun:
             self.key(3),
             self.directory,
             steps=settings.steps,
+            log_every=LOGGED,
         )
         residual = fit_planning(
             model, params, space, dataset.train, self.key(4), steps=settings.steps
@@ -336,7 +347,7 @@ def certify_system(
         ArtefactError: the directory has a run of another system or other settings.
     """
     parsed = TubeSettings(**settings)
-    check_intervals(parsed)
+    _check(parsed, system)
     tracked = Tracked(system, frame)
     system.check_step()
     tracked.check_invariance(jax.random.key(0))
@@ -349,6 +360,26 @@ def certify_system(
             if isinstance(certificate, Refusal):
                 raise CertificationRefused(certificate.reason)
     return policy.load_system(run.directory)
+
+
+def _check(settings: TubeSettings, system: System) -> None:
+    """Raise a ValueError for settings with which nothing could be certified."""
+    check_intervals(settings)
+    if settings.dwell[0] > settings.dwell[1]:
+        raise ValueError(f"dwell must be ascending, got {settings.dwell}")
+    if settings.steps % LOGGED:
+        raise ValueError(f"steps must be a multiple of {LOGGED}, got {settings.steps}")
+    if settings.duration < system.dt:
+        raise ValueError(
+            f"duration must be a sampling period of {system.dt:g} s at least, "
+            f"got {settings.duration:g}"
+        )
+    needed = ceil(settings.level / (1.0 - settings.level))
+    if settings.runs < needed:
+        raise ValueError(
+            f"runs must be {needed} at least for a level of {settings.level:g}, "
+            f"got {settings.runs}"
+        )
 
 
 def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:

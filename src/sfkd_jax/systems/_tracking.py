@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.geometry import wrap_angle
 from sfkd_jax.systems._system import Ends, System, check_ends
@@ -25,6 +25,8 @@ Error: TypeAlias = Float[Array, " state"]
 """ξ: the state less that of the reference, where the reference has it."""
 INVARIANCE = 1e-3
 """Largest change of a step by what should not matter, relative to the step."""
+BESIDE = 0.05
+"""Share of the range of a rate by which a reference may differ from its chains."""
 PLACES = 8
 """Number of places at which the invariance is tried."""
 ROUNDING = 1e-9
@@ -274,6 +276,28 @@ class Tracked:
             after.append(first + second * dt + 0.5 * rate * dt**2)
             after.append(second + rate * dt)
         return jnp.stack(after)
+
+    def moves(
+        self,
+        reference: ReferenceState,
+        rates: Float[Array, " chain"],
+        after: ReferenceState,
+    ) -> Bool[Array, ""]:
+        """Return whether a reference moves to another as its chains say.
+
+        It does if each state is where `advance` takes it, but for rounding and for what
+        a share of `BESIDE` of the range of its rate changes in a sampling period.
+        """
+        dt = self.system.dt
+        rooms = []
+        for chain, (low, high) in self.frame.reference.items():
+            room = BESIDE * (high - low) * dt
+            rooms.extend([0.5 * room * dt, room] if len(chain) == 2 else [room])
+        epsilon = jnp.finfo(reference.dtype).eps
+        room = jnp.asarray(rooms) + 4.0 * epsilon * (jnp.abs(reference) + 1.0)
+        expected = self._whole(self.advance(reference, rates))
+        apart = self.coordinates(expected, after)[np.asarray(self.chained)]
+        return jnp.all(jnp.abs(apart) <= room)
 
     def step(
         self, error: Error, control: Control, inputs: Inputs, env: Environment
