@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax import models, policy, store
+from sfkd_jax import policy, store
 from sfkd_jax.certificate import Provenance, Refusal, write
 from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
 from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
@@ -211,7 +211,7 @@ class SystemRun:
         dataset = self.dataset
         space = measure_space(dataset)
         model_settings = {**MODEL, "rho": LARGEST_RATE - BUDGET, "beta": BUDGET}
-        model = models.sfkd(space, frame=self.tracked.model_frame, **model_settings)
+        model = policy.system_model(self.tracked, space, model_settings)
         rows = {row for rows in self.tracked.rows.values() for row in rows}
         weights = [TUBE if row in rows else 0.0 for row in range(max(rows) + 1)]
         loss = multi_step_loss(model, space, tube=tuple(weights))
