@@ -70,4 +70,4 @@ def loop(rate=RATE):
 
 def exact_model(of):
     """The closed loop itself as a model, which has no error."""
-    return models.physics(of.step)
+    return models.physics(of.step, frame=of.tracked.model_frame)

@@ -261,7 +261,7 @@ def test_positions_are_relative_before_the_cast_and_reported_in_the_world():
         info = ControllerInfo(plan=PlanInfo(states=jnp.tile(observation, (2, 1))))
         return reference[0, :2] - observation[:2], state, info
 
-    echo = policy._entrance(Controller(lambda key: key, act), trained)
+    echo = policy._calling.entrance(Controller(lambda key: key, act), trained)
     near = np.float64(straight(20))
     far = np.add(near, [5e5 + 0.13, 4.5e6, 0.0, 0.0])
     expected = near[0, :2] - near[1, :2]

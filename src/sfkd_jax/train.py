@@ -76,4 +76,4 @@ def _run_stages(run: Run) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    hydra_command(main)()
+    hydra_command(main, of_systems=True)()

@@ -3,7 +3,6 @@
 import runpy
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest

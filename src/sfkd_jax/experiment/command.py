@@ -46,8 +46,12 @@ LONGEST_NAME = 160
 """The most characters of a directory name of a sweep; file systems allow 255."""
 
 
-def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None]:
+def hydra_command(
+    command: Callable[[Run], dict[str, Any]], *, of_systems: bool = False
+) -> Callable[[], None]:
     """Make `command(run) -> document` a command, whose `Run` is made here.
+
+    A command that is not `of_systems` refuses the setting `system`.
 
     The command prints the document as JSON in the last line of stdout. Expected errors
     become one line on stderr and an exit code. A job of a sweep returns "objective" to
@@ -60,6 +64,8 @@ def hydra_command(command: Callable[[Run], dict[str, Any]]) -> Callable[[], None
         sweeping = HydraConfig.get().mode == RunMode.MULTIRUN
         try:
             settings = named_for_controller(settings_of(composed, _typed()))
+            if settings.system is not None and not of_systems:
+                raise ValueError("system=… is for sfkd_jax.train, which does all of it")
             if derived := summary(settings):
                 print_message(derived)
             if sweeping:

@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sfkd_jax import models, policy, store
+from sfkd_jax import policy, store
 from sfkd_jax.certificate import Provenance, Refusal, write
 from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
 from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
@@ -56,6 +57,8 @@ SMALLEST_PART = 64
 """Smallest number of segments of a part."""
 FIRST_PART = 10
 """Stream of the random keys of the first part."""
+LOGGED = 50
+"""Steps of the training between two lines of its log."""
 SEGMENT = 60
 """Steps of a segment."""
 COMPARED = 8
@@ -178,7 +181,7 @@ class SystemRun:
         dataset = self.dataset
         space = measure_space(dataset)
         model_settings = {**MODEL, "rho": LARGEST_RATE - BUDGET, "beta": BUDGET}
-        model = models.sfkd(space, frame=self.tracked.model_frame, **model_settings)
+        model = policy.system_model(self.tracked, space, model_settings)
         rows = {row for rows in self.tracked.rows.values() for row in rows}
         weights = [TUBE if row in rows else 0.0 for row in range(max(rows) + 1)]
         loss = multi_step_loss(model, space, tube=tuple(weights))
@@ -192,6 +195,7 @@ class SystemRun:
             self.key(3),
             self.directory,
             steps=settings.steps,
+            log_every=LOGGED,
         )
         residual = fit_planning(
             model, params, space, dataset.train, self.key(4), steps=settings.steps
@@ -319,6 +323,7 @@ def certify_system(
         ArtefactError: the directory has a run of another system or other settings.
     """
     parsed = parse(TubeSettings, settings, "tubes.")
+    _check(parsed, system)
     tracked = Tracked(system, frame)
     system.check_step(tracked.state(jnp.zeros(len(tracked.names)), tracked.middle))
     tracked.check_invariance(jax.random.key(0))
@@ -331,6 +336,23 @@ def certify_system(
             if isinstance(certificate, Refusal):
                 raise CertificationRefused(certificate.reason)
     return policy.load_system(run.directory)
+
+
+def _check(settings: TubeSettings, system: System) -> None:
+    """Raise a ValueError for settings with which nothing could be certified."""
+    if settings.steps % LOGGED:
+        raise ValueError(f"steps must be a multiple of {LOGGED}, got {settings.steps}")
+    if settings.duration < system.dt:
+        raise ValueError(
+            f"duration must be a sampling period of {system.dt:g} s at least, "
+            f"got {settings.duration:g}"
+        )
+    needed = ceil(settings.level / (1.0 - settings.level))
+    if settings.runs < needed:
+        raise ValueError(
+            f"runs must be {needed} at least for a level of {settings.level:g}, "
+            f"got {settings.runs}"
+        )
 
 
 def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:

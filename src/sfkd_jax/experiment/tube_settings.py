@@ -17,7 +17,7 @@ class TubeSettings:
         perturbation: largest |ν|, relative to half of the range of each control.
         dwell: range of times between two switches of e [s].
         segments: number of segments of the data, relative to the full size.
-        steps: optimiser steps of the training.
+        steps: optimiser steps of the training, a multiple of 50.
         runs: number of runs of each part that calibrates or tests the tubes.
         duration: of these runs [s].
         level: 1 − δ.

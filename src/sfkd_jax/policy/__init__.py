@@ -36,6 +36,7 @@ from sfkd_jax.policy._system_policy import restore_system as restore_system
 from sfkd_jax.policy._system_policy import save_system as save_system
 from sfkd_jax.policy._system_policy import shielded as shielded
 from sfkd_jax.policy._system_policy import system_file as system_file
+from sfkd_jax.policy._system_policy import system_model as system_model
 from sfkd_jax.policy._trained import KIND as KIND
 from sfkd_jax.policy._trained import LAW as LAW
 from sfkd_jax.policy._trained import TrainedModel as TrainedModel

@@ -152,6 +152,15 @@ def describe_system(tracked: Tracked) -> dict[str, Any]:
     }
 
 
+def system_model(tracked: Tracked, space: Space, settings: Values) -> Model:
+    """Return the model of a closed loop from its settings, as JSON has them."""
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in settings.items()
+    }
+    return models.sfkd(space, frame=tracked.model_frame, **given)
+
+
 def system_file(path: str | Path) -> Path:
     """Return the file of the policy in the run directory of a system."""
     return Path(path) / FILE
@@ -184,7 +193,7 @@ def restore_system(path: str | Path) -> TrainedSystem:
     with store.as_artefact_error(file, ValueError, TypeError, KeyError):
         tracked = _tracked_from(settings)
         space = Space(*(jnp.asarray(settings["space"][name]) for name in Space._fields))
-        model = models.sfkd(space, frame=tracked.model_frame, **settings["model"])
+        model = system_model(tracked, space, settings["model"])
         prefix = f"{LAW}/"
         tables = {
             name: jnp.asarray(arrays.pop(prefix + name), jnp.float32)

@@ -8,6 +8,9 @@ from sfkd_jax.systems._closed_loop import ClosedLoop as ClosedLoop
 from sfkd_jax.systems._controller import Following as Following
 from sfkd_jax.systems._derivation import derive_law as derive_law
 from sfkd_jax.systems._derivation import fastest_law as fastest_law
+from sfkd_jax.systems._frame import Tracking as Tracking
+from sfkd_jax.systems._frame import regulation as regulation
+from sfkd_jax.systems._frame import tracking as tracking
 from sfkd_jax.systems._law import Law as Law
 from sfkd_jax.systems._law import SteadyState as SteadyState
 from sfkd_jax.systems._runs import Reference as Reference
@@ -24,6 +27,3 @@ from sfkd_jax.systems._system import integrated as integrated
 from sfkd_jax.systems._task import TrackingTask as TrackingTask
 from sfkd_jax.systems._task import tracking_task as tracking_task
 from sfkd_jax.systems._tracking import Tracked as Tracked
-from sfkd_jax.systems._tracking import Tracking as Tracking
-from sfkd_jax.systems._tracking import regulation as regulation
-from sfkd_jax.systems._tracking import tracking as tracking

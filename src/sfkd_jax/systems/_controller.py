@@ -47,6 +47,9 @@ class Following(Stateful):
         error = tracked.coordinates(observation, reference[0])
         rates = tracked.rates_between(reference)
         inputs = jax.vmap(tracked.inputs)(reference[:-1], rates)
+        # A bound holds for what moves as the chains say; nobody can follow a jump.
+        moves = jax.vmap(tracked.moves)(reference[:-1], rates, reference[1:])
+        inputs = jnp.where(moves[:, None], inputs, jnp.nan)
         control, after, info = self.inner.act(params, state, error, env, inputs)
         path = PathInfo(xi=error, inputs=inputs[0], planned=info.plan.states)
         return control, after, info._replace(path=path)

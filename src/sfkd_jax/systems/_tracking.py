@@ -1,19 +1,19 @@
-"""Tracking: a system relative to a reference that moves."""
+"""A system relative to a reference that moves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sfkd_jax.geometry import wrap_angle
-from sfkd_jax.systems._system import Ends, System, check_ends
+from sfkd_jax.systems._frame import Tracking
+from sfkd_jax.systems._system import System
 from sfkd_jax.types import BODY, Control, Environment, Frame, Key, State
 
 ReferenceState: TypeAlias = Float[Array, " reference"]
@@ -25,6 +25,8 @@ Error: TypeAlias = Float[Array, " state"]
 """ξ: the state less that of the reference, where the reference has it."""
 INVARIANCE = 1e-3
 """Largest change of a step by what should not matter, relative to the step."""
+BESIDE = 0.05
+"""Share of the range of a rate by which a reference may differ from its chains."""
 PLACES = 8
 """Number of places at which the invariance is tried."""
 ROUNDING = 1e-9
@@ -32,131 +34,6 @@ ROUNDING = 1e-9
 LENGTH = 0.1
 """What half the width of an entry of ξ counts in a training loss, in place of metres.
 """
-
-
-@dataclass(frozen=True, eq=False)
-class Tracking:
-    """Coordinates relative to a reference, ξ = x − x_ref, for any system.
-
-    The reference consists of chains: ("x", "vx") says that vx is the rate of x, and its
-    range is that of the rate of vx, which is constant over a sampling period. States in
-    no chain, such as the roll of a quadrotor, stay as they are in ξ. A chain of one
-    state is a set point that moves at a limited rate.
-
-    Attributes:
-        outputs: name -> states; of each output a tube is certified.
-        reference: chain of one or two states -> range of the rate of the last of them.
-        ranges: state in a chain -> range of the reference. A state needs one if the
-            system behaves differently elsewhere: the velocity of a body with drag, or
-            the angle of a pendulum. The law and the model then depend on it.
-        dwell: shortest and longest time between two changes of the reference [s].
-        held: states whose ξ is 0 where the system follows its reference, as many as
-            there are controls; () for the first state of every chain.
-
-    Raises:
-        ValueError: a chain, a range or an output does not fit; gives the reason.
-    """
-
-    outputs: Mapping[str, tuple[str, ...]]
-    _: KW_ONLY
-    reference: Mapping[tuple[str, ...], Ends]
-    ranges: Mapping[str, Ends]
-    dwell: tuple[float, float]
-    held: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.outputs or not self.reference:
-            raise ValueError("a frame needs an output and a reference")
-        for name, states in self.outputs.items():
-            _check_states(f"outputs: {name}", states)
-        for chain in self.reference:
-            _check_states("reference: a chain", chain)
-        listed = [state for chain in self.reference for state in chain]
-        if len(set(listed)) < len(listed):
-            raise ValueError(f"reference: a state is in two chains: {listed}")
-        for chain, ends in self.reference.items():
-            if not 1 <= len(chain) <= 2:
-                raise ValueError(f"reference: a chain has 1 or 2 states, got {chain}")
-            check_ends(f"reference: the rate of {chain[-1]}", ends)
-            if not ends[0] < 0.0 < ends[1]:
-                raise ValueError(f"reference: the rate of {chain[-1]} has no 0 inside")
-        for state, ends in self.ranges.items():
-            if state not in listed:
-                raise ValueError(f"ranges: {state} is in no chain of the reference")
-            check_ends(f"ranges: {state}", ends)
-        for chain in self.reference:
-            ends = self.ranges.get(chain[-1], (-1.0, 1.0))
-            if chain[0] in self.ranges and len(chain) == 2 and ends[0] * ends[1] >= 0.0:
-                raise ValueError(
-                    f"ranges: {chain[0]} cannot stay in its range, since that of "
-                    f"{chain[1]} has no 0 inside"
-                )
-        _check_dwell(self.dwell)
-
-    @property
-    def chained(self) -> tuple[str, ...]:
-        """The states of the reference, chain after chain."""
-        return tuple(state for chain in self.reference for state in chain)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Names of the entries of ρ."""
-        rates = (f"rate of {chain[-1]}" for chain in self.reference)
-        return (*rates, *self.ranges)
-
-    @property
-    def input_box(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Lower and upper ends of ρ."""
-        ends = [*self.reference.values(), *self.ranges.values()]
-        low = tuple(float(pair[0]) for pair in ends)
-        return low, tuple(float(pair[1]) for pair in ends)
-
-
-def tracking(
-    outputs: Mapping[str, tuple[str, ...]],
-    *,
-    reference: Mapping[tuple[str, ...], Ends],
-    ranges: Mapping[str, Ends] | None = None,
-    dwell: tuple[float, float] = (0.5, 2.0),
-    held: tuple[str, ...] = (),
-) -> Tracking:
-    """Return coordinates relative to a reference that moves; see `Tracking`."""
-    return Tracking(
-        outputs,
-        reference=reference,
-        ranges=ranges or {},
-        dwell=dwell,
-        held=held,
-    )
-
-
-def regulation(
-    outputs: Mapping[str, tuple[str, ...]],
-    *,
-    set_points: Mapping[str, Ends],
-    rates: Mapping[str, float],
-    dwell: tuple[float, float] = (1.0, 4.0),
-    held: tuple[str, ...] = (),
-) -> Tracking:
-    """Return coordinates relative to set points; see `Tracking`.
-
-    Args:
-        outputs: name -> states.
-        set_points: state -> range of its set point.
-        rates: state -> largest rate at which its set point moves, to both sides.
-        dwell: shortest and longest time between two changes of the set points [s].
-        held: states that reach their set points, as many as there are controls; () for
-            all states of `set_points`.
-    """
-    if set(rates) != set(set_points):
-        raise ValueError(f"rates: one for each of {', '.join(set_points)}")
-    return Tracking(
-        outputs,
-        reference={(state,): (-rates[state], rates[state]) for state in set_points},
-        ranges=set_points,
-        dwell=dwell,
-        held=held,
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +157,28 @@ class Tracked:
             after.append(second + rate * dt)
         return jnp.stack(after)
 
+    def moves(
+        self,
+        reference: ReferenceState,
+        rates: Float[Array, " chain"],
+        after: ReferenceState,
+    ) -> Bool[Array, ""]:
+        """Return whether a reference moves to another as its chains say.
+
+        It does if each state is where `advance` takes it, but for rounding and for what
+        a share of `BESIDE` of the range of its rate changes in a sampling period.
+        """
+        dt = self.system.dt
+        rooms = []
+        for chain, (low, high) in self.frame.reference.items():
+            room = BESIDE * (high - low) * dt
+            rooms.extend([0.5 * room * dt, room] if len(chain) == 2 else [room])
+        epsilon = jnp.finfo(reference.dtype).eps
+        room = jnp.asarray(rooms) + 4.0 * epsilon * (jnp.abs(reference) + 1.0)
+        expected = self._whole(self.advance(reference, rates))
+        apart = self.coordinates(expected, after)[np.asarray(self.chained)]
+        return jnp.all(jnp.abs(apart) <= room)
+
     def step(
         self, error: Error, control: Control, inputs: Inputs, env: Environment
     ) -> Error:
@@ -380,17 +279,3 @@ def _drawn(key: Key, box: tuple[tuple[float, ...], tuple[float, ...]]) -> Array:
     """Draw a point of a box."""
     low, high = map(jnp.asarray, box)
     return jax.random.uniform(key, low.shape, minval=low, maxval=high)
-
-
-def _check_states(what: str, states: Any) -> None:
-    """Raise a ValueError unless these are names of states, in a tuple."""
-    is_sequence = isinstance(states, tuple | list) and len(states) > 0
-    if not (is_sequence and all(isinstance(state, str) for state in states)):
-        raise ValueError(f'{what} is states as in ("x", "y"), got {states!r}')
-
-
-def _check_dwell(dwell: Any) -> None:
-    """Raise a ValueError unless these are two times, the shorter first."""
-    is_pair = isinstance(dwell, tuple | list) and len(dwell) == 2
-    if not (is_pair and 0.0 < dwell[0] <= dwell[1] < np.inf):
-        raise ValueError(f"dwell: two rising times above 0, got {dwell!r}")

@@ -58,6 +58,8 @@ def _require_conditions(certificate: SystemCertificate, trained: Trained) -> Non
         "input_box": frame.input_box,
         "reference_dwell_s": frame.dwell,
         "env_box": system.env_box,
+        "env_dwell_s": trained.settings["settings"]["dwell"],
+        "duration_s": trained.settings["settings"]["duration"],
         "sensor_noise": system.sensor_noise,
         "perturbation": np.asarray(trained.loop.law.perturbation).tolist(),
     }
@@ -65,4 +67,9 @@ def _require_conditions(certificate: SystemCertificate, trained: Trained) -> Non
         require(
             near(getattr(conditions, name), value, REPEATED),
             f"tubes.conditions.{name} is not that of the policy",
+        )
+    for name in ("level", "runs"):
+        require(
+            getattr(certificate.tubes, name) == trained.settings["settings"][name],
+            f"tubes.{name} is not that of the policy",
         )
