@@ -10,8 +10,8 @@ from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
+from sfkd_jax.experiment.named_system import train_system
 from sfkd_jax.experiment.run import Run
-from sfkd_jax.experiment.systems import train_system
 from sfkd_jax.report.run import write_report
 
 

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from sfkd_jax.certification._metric_claims import (
     reads_within,
     size_of,
 )
+from sfkd_jax.certification._metric_starts import ProvedMetric, starts
 from sfkd_jax.certification._search import INFEASIBLE, SLACKS, joint_bound, reduced
 from sfkd_jax.certification._weights import (
     CertificationRefused,
@@ -39,10 +40,6 @@ from sfkd_jax.certification._weights import (
 )
 from sfkd_jax.types import Polytope
 
-TINY = 1e-12
-"""Smallest multiplier of a start, whose logarithm the search moves."""
-ProvedMetric: TypeAlias = tuple[Matrix, Sequence[Sequence[Any]]]
-"""A metric, and the multipliers of every vertex that prove contraction in it."""
 MARGIN = 1e-6
 """Relative tightening of constraints, which solvers may violate slightly."""
 SHARES = (0.5, 0.75, 0.9)
@@ -209,19 +206,7 @@ def propose_metric(
     rank = vertices.shape[-1]
     lower = np.tril_indices(rank)
     entries = len(lower[0])
-    candidates = []
-    usual = [multipliers] * len(vertices)
-    others = [(metric, usual) for metric, _ in proved]
-    for metric, joint in ((np.eye(rank), usual), *others):
-        # Scaled to the trace of I, so that all starts have entries of the same size.
-        factor = np.linalg.cholesky(metric * (rank / np.trace(metric)))
-        candidates.append(np.concatenate([factor[lower], *map(_logs, joint)]))
-    for metric, joint in proved:
-        # Multipliers scale with P.
-        share = rank / np.trace(metric)
-        factor = np.linalg.cholesky(share * metric)
-        logs = [np.log(share) + _logs(of_vertex) for of_vertex in joint]
-        candidates.append(np.concatenate([factor[lower], *logs]))
+    candidates = starts(weights, proved)
 
     def objective(flat: Vector, sharpness: float) -> tuple[float, Vector]:
         loss, gradient = _log_radius(
@@ -268,11 +253,6 @@ def propose_metric(
         # The search may end where rounding spoils the proof. Where it began is worse,
         # but proves something.
         return accepted(best)
-
-
-def _logs(multipliers: Sequence[Any]) -> Vector:
-    """Return logarithms of multipliers, over which the search keeps them positive."""
-    return np.log(np.maximum(np.concatenate([*multipliers, []]), TINY))
 
 
 def accepted_metric(

@@ -22,11 +22,8 @@ from sfkd_jax.certification._metric_claims import (
     require_lyapunov,
     require_output_metrics,
 )
-from sfkd_jax.certification._metrics import (
-    ProvedMetric,
-    propose_metric,
-    prove_lyapunov,
-)
+from sfkd_jax.certification._metric_starts import ProvedMetric
+from sfkd_jax.certification._metrics import propose_metric, prove_lyapunov
 from sfkd_jax.certification._search import prove_claims
 from sfkd_jax.certification._weights import (
     CertificateStale,

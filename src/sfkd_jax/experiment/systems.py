@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -22,11 +21,9 @@ from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prov
 from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import fit_planning
-from sfkd_jax.experiment.options import Settings
-from sfkd_jax.experiment.system_runs import compare_system
 from sfkd_jax.experiment.tube_settings import TubeSettings
 from sfkd_jax.policy import CERTIFICATE, SystemPolicy, TrainedSystem
-from sfkd_jax.ranges import NonNegativeInt, imported
+from sfkd_jax.ranges import NonNegativeInt
 from sfkd_jax.rollout import fold, on_host
 from sfkd_jax.settings import parse
 from sfkd_jax.systems import (
@@ -61,8 +58,6 @@ LOGGED = 50
 """Steps of the training between two lines of its log."""
 SEGMENT = 60
 """Steps of a segment."""
-COMPARED = 8
-"""Number of runs in which controllers are compared."""
 SPREAD_STEPS = 300
 """Steps of the runs that tell how far the loop moves."""
 PROBES = 4
@@ -369,47 +364,3 @@ def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:
         return tracked.system.step(state, control, env)
 
     return jax.vmap(probe)(jax.random.split(key, PROBES))
-
-
-def train_system(settings: Settings) -> dict[str, Any]:
-    """Certify the system that the settings of a command name, and compare it.
-
-    Args:
-        settings: of the command; `system` is package.module:function, which returns a
-            `System` and a `Tracking`.
-
-    Raises:
-        ValueError: the function does not return these.
-    """
-    began = time.perf_counter()
-    make = imported(str(settings.system), "system")
-    if not callable(make) or inspect.signature(make).parameters:
-        raise ValueError(f"system={settings.system} must be a function of no arguments")
-    made: Any = make()
-    is_pair = isinstance(made, tuple) and len(made) == 2
-    if not (is_pair and isinstance(made[0], System) and isinstance(made[1], Tracking)):
-        raise ValueError(
-            f"system={settings.system} must return a System and what it follows, as "
-            f"sfkd_jax.tracking returns it; got {type(made).__name__}"
-        )
-    system, frame = made
-    directory = Path(settings.root) / settings.name
-    certified = certify_system(
-        system, frame, root=directory, seed=settings.seed, **vars(settings.tubes)
-    )
-    store.print_message(str(certified))
-    compared = compare_system(certified, system, runs=COMPARED)
-    tubes = certified.certificate.tubes
-    result = {
-        "run": str(directory),
-        "system": system.name,
-        "states": len(system.states),
-        "alpha": certified.certificate.proof.alpha,
-        "outputs": {name: vars(bounds) for name, bounds in tubes.outputs.items()},
-        "coverage": tubes.coverage.share,
-        "coverage_ci95": list(tubes.coverage.ci95),
-        **compared,
-        "seconds": time.perf_counter() - began,
-    }
-    store.write_json(directory / "comparison.json", result)
-    return result
