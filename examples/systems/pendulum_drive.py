@@ -1,10 +1,10 @@
 """A motor that moves a pendulum through an elastic gear: angle of the pendulum.
 
-    (J_l + m l²) q̈ = k (θ - q) + c (θ̇ - q̇) - (m l + s) g sin q
-    J_m θ̈ = τ - b θ̇ - k (θ - q) - c (θ̇ - q̇)
+    (J_l + m l²) q̈ = k δ + c δ̇ - (m l + s) g sin q,   J_m θ̈ = τ - b θ̇ - k δ - c δ̇
 
-The load m hangs at the end of the pendulum, whose own first moment is s. The stiffness
-k of the gear depends on its temperature. All is seen from the side of the pendulum.
+δ = θ - q is the twist of the gear. It is a state in place of the motor's angle θ, which
+has no steady state while the pendulum moves. The load m hangs at the end of the
+pendulum, whose own first moment is s. The stiffness k depends on the temperature.
 
 Source of the equations: Spong, Hutchinson and Vidyasagar, Robot Modeling and Control,
 section 6.5 (flexible joint).
@@ -26,24 +26,21 @@ GRAVITY = 9.81  # [m/s²]
 
 def rates(state, control, env):
     """Derivatives of the states."""
-    angle, turn, motor, spin = state
+    angle, turn, twist, twisting = state
     load, stiffness = env
-    passed = stiffness * (motor - angle) + DAMPING * (spin - turn)
+    passed = stiffness * twist + DAMPING * twisting
     weight = (load * LENGTH + MOMENT) * GRAVITY * jnp.sin(angle)
     inertia = PENDULUM + load * LENGTH**2
-    return [
-        turn,
-        (passed - weight) / inertia,
-        spin,
-        (control[0] - FRICTION * spin - passed) / MOTOR,
-    ]
+    swing = (passed - weight) / inertia
+    spin = (control[0] - FRICTION * (turn + twisting) - passed) / MOTOR
+    return [turn, swing, twisting, spin - swing]
 
 
 def make():
     """Return the system, and what it follows: an angle that accelerates."""
     # Standard deviations of the sensors.
     states = {"angle [rad]": 0.0002, "turn [rad/s]": 0.002}
-    states |= {"motor [rad]": 0.0002, "spin [rad/s]": 0.002}
+    states |= {"twist [rad]": 0.0002, "twisting [rad/s]": 0.002}
     system = System(
         integrated(rates, dt=DT, substeps=2),
         dt=DT,

@@ -11,8 +11,10 @@ from loops import DT, FASTEST, MASS, WIND, frame, loop, mass
 
 from sfkd_jax.systems import (
     ClosedLoop,
+    System,
     Tracked,
     derive_law,
+    integrated,
     random_reference,
     random_runs,
     regulation,
@@ -156,3 +158,28 @@ def test_the_spread_is_that_of_runs_from_steady_states(key):
     assert spread.shape == (2,)
     # ν of at most 0.05 * 4 N, on a mass of about 1 kg whose law contracts.
     assert np.all((spread > 1e-4) & (spread < 0.3))
+
+
+def test_what_a_steady_state_changes_by_is_no_spread(key):
+    """The drive of a wheel follows its speed, which is anywhere in its range."""
+
+    def rates(state, control, env):
+        speed, drive = state
+        return [drive - env[0] * speed, control[0] - drive]
+
+    system = System(
+        integrated(rates, dt=0.1),
+        dt=0.1,
+        states={"speed [m/s]": 0.0, "drive [m/s²]": 0.0},
+        controls={"push [m/s²]": (-40.0, 40.0)},
+        environment={"drag [1/s]": (1.0, 1.01)},
+    )
+    wheel = regulation(
+        {"speed": ("speed",)}, set_points={"speed": (-10.0, 10.0)}, rates={"speed": 0.5}
+    )
+    tracked = Tracked(system, wheel)
+    steady = steady_states(tracked, points=3)
+    of = ClosedLoop(tracked, derive_law(tracked, steady, rate=0.75))
+    assert steady.states[:, 1].std() > 5.0
+    _, drive = spread_of(of, key, steps=STEPS, dwell=DWELL)
+    assert drive < 1.5

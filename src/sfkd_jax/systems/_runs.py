@@ -302,9 +302,21 @@ def _from_steady(loop: ClosedLoop, key: Key, steps: int, dwell: Span) -> Traject
 def spread_of(
     loop: ClosedLoop, key: Key, *, steps: int, dwell: Span
 ) -> Float[Array, " state"]:
-    """Return the standard deviations of ξ in runs that begin at steady states."""
-    states = _from_steady(loop, key, steps, dwell).states[..., BODY]
-    return jnp.std(states.reshape(-1, len(loop.tracked.names)), axis=0)
+    """Return the standard deviations of ξ − ξ* in runs that begin at steady states.
+
+    What a steady state itself changes by, such as the angle of a motor that drives a
+    pendulum to its set point, is no deviation from it.
+    """
+    runs = _from_steady(loop, key, steps, dwell)
+
+    def deviation(state: State, control: Control, env: Environment) -> Array:
+        _, inputs = loop.split(control)
+        return state[BODY] - loop.law.at(inputs, env).state
+
+    deviations = jax.vmap(jax.vmap(deviation))(
+        runs.states[:, :-1], runs.controls, runs.envs
+    )
+    return jnp.std(deviations.reshape(-1, len(loop.tracked.names)), axis=0)
 
 
 def saturation(loop: ClosedLoop, key: Key, *, steps: int, dwell: Span) -> float:
