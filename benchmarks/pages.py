@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks import PRETRAINED, ROOT, is_old
 from benchmarks.tables import Measured, measured, table
 from experiments import results
-from experiments.simulator import PREFIXES
+from experiments.simulator import LAW, PREFIXES
 from sfkd_jax import certificate, store
 from sfkd_jax.driving.certificate import DrivingCertificate
 
@@ -74,7 +74,7 @@ def claims():
     """What is claimed of every car's corridor: a list of (numbers by name, whether old).
 
     The shipped policies come first, whose certificates are bound to the weights, and then
-    the car of highway-env.
+    the cars of `FOREIGN`.
     """
     found = []
     for about, alpha, old in shipped():
@@ -88,8 +88,8 @@ def claims():
         for group, counted in about.by_group.items():
             numbers[f"coverage_{group}"] = counted.coverage.share
         found.append((numbers, old))
-    foreign = read("experiments/simulator.json")
-    found.append((foreign, is_old(foreign)))
+    for foreign in foreign_lines():
+        found.append((foreign, is_old(foreign)))
     for numbers, _ in found:
         numbers["lower"], numbers["upper"] = numbers["coverage_ci95"]
     return found
@@ -120,12 +120,24 @@ RIVALS = {
     "law": "the law alone",
 }
 """Row of corridor.json -> who drives, on the first page."""
-FOREIGN = {"sfkd": ""} | PREFIXES
-"""Row of corridor.json -> prefix of the same in simulator.json."""
+SAME_ROW = {"sfkd": "", "law": LAW} | PREFIXES
+"""Row of corridor.json -> prefix of the same in the line of a car of `FOREIGN`."""
+FOREIGN = {"highway-env": "simulator", "slipx, 1/10": "slipx"}
+"""Cars that nobody here wrote -> file of their line."""
+
+
+def foreign_lines():
+    """What was found of the cars that nobody here wrote."""
+    return [read(f"experiments/{file}.json") for file in FOREIGN.values()]
+
+
+def of_every_car(page):
+    """The heads of a table with a column a car, from the folder of the page."""
+    return ["", *CARS, *(f"[{name}]({page})" for name in FOREIGN)]
 
 
 def corridor():
-    """The first page: corridors of two shipped policies and of a foreign car; S3."""
+    """The first page: corridors of two shipped policies and of foreign cars; S3."""
     lines = claimed(
         [
             ("corridor half width [m]", "corridor_m", "{:.3f}"),
@@ -133,7 +145,6 @@ def corridor():
             ("contraction rate (proved)", "alpha", "{:.2f}"),
         ]
     )
-    foreign = read("experiments/simulator.json")
     driven = {
         (row["vehicle"], row["row"]): row
         for row in read("experiments/corridor.json")["rows"]
@@ -142,15 +153,18 @@ def corridor():
     for system, name in RIVALS.items():
         rows = {car: driven[car, system] for car in CARS}
         line = [f"S3, lateral RMSE of {name} [mm]", *by_car(mean_error, rows)]
-        if system in FOREIGN:
-            prefix = FOREIGN[system]
-            error = foreign[f"{prefix}rmse_mm"]
-            departures = foreign[f"{prefix}departures"]
-            line.append(measured(in_millimetres(error, departures), foreign))
-        else:
-            line.append(NONE)
+        line += [foreign_error(system, found) for found in foreign_lines()]
         lines.append(line)
-    return table(["", *CARS, "[highway-env](docs/your-vehicle.md)"], lines)
+    return table(of_every_car("docs/your-vehicle.md"), lines)
+
+
+def foreign_error(system, found):
+    """Mean error of a system on a car of `FOREIGN`, if it drove there."""
+    prefix = SAME_ROW.get(system)
+    error = found.get(f"{prefix}rmse_mm")
+    if error is None:
+        return NONE
+    return measured(in_millimetres(error, found[f"{prefix}departures"]), found)
 
 
 def mean_error(row):
@@ -166,7 +180,7 @@ def in_millimetres(error, left_the_lane):
 
 
 def wide():
-    """What the certificates claim, and the same of the foreign car."""
+    """What the certificates claim, and the same of the foreign cars."""
     inside = "share of fresh runs inside"
     lines = claimed(
         [
@@ -181,7 +195,7 @@ def wide():
             ("contraction rate (proved)", "alpha", "{:.3f}"),
         ]
     )
-    return table(["", *CARS, "[highway-env](your-vehicle.md)"], lines)
+    return table(of_every_car("your-vehicle.md"), lines)
 
 
 # ---- outside the box

@@ -21,11 +21,11 @@ PREFIXES = {
     "law_stanley": "stanley_",
     "law_pure_pursuit": "pure_pursuit_",
 }
-"""System -> beginning of the names of its numbers; those of the policy have none, and
-"estimated_" where it estimates the environment.
-"""
-ROWS = PREFIXES | {"law_learned": "law_"}
-"""The same, with the law of the policy alone, which not every script drives."""
+"""System -> beginning of the names of its numbers; those of the policy have none."""
+ESTIMATED = "estimated_"
+"""That of the policy where it estimates the environment."""
+LAW = "law_"
+"""That of the law of the policy, which drives alone where one sample is drawn."""
 
 
 def main():
@@ -43,13 +43,24 @@ def main():
     }
     for run in runs:
         for row in json.loads((run / "results.json").read_text("utf-8"))["rows"]:
-            estimated = row["env"] == "estimated"
-            name = "estimated_" if estimated else ROWS.get(row["system"], "")
+            name = prefix(row)
             found[f"{name}rmse_mm"] = round(1e3 * row["rmse_m"]["mean"], 1)
             found[f"{name}departures"] = row["departures"]
+            # There is none of runs that are not finite.
+            if row["max_deviation_m"] is not None:
+                found[f"{name}worst_m"] = row["max_deviation_m"]
     rounded = {name: np.round(value, 3).tolist() for name, value in found.items()}
     law = {"law": corridor.conditions.law_model}
     print(json.dumps(law | rounded | stamp()))
+
+
+def prefix(row):
+    """The beginning of the names of the numbers of a row."""
+    if row["system"] in PREFIXES:
+        return PREFIXES[row["system"]]
+    if row["env"] == "estimated":
+        return ESTIMATED
+    return LAW if "mppi.num_samples=1" in row["controller"].split(",") else ""
 
 
 if __name__ == "__main__":

@@ -169,10 +169,12 @@ def test_every_table_of_numbers_is_made_from_a_committed_result():
     assert errors in prose["your-vehicle"]
     small = pages.read("experiments/slipx.json")
     for words in (
-        "The corridor was {corridor_m} m,",
-        "and the error {rmse_mm} mm. The law alone had {law_rmse_mm} mm",
-        "the textbook bicycle {nominal_mppi_rmse_mm} mm, and Stanley's law "
+        "the corridor was {corridor_m} m, and the error {rmse_mm} mm",
+        "The law alone had {law_rmse_mm} mm",
+        "Pure pursuit had {pure_pursuit_rmse_mm} mm and Stanley's law "
         "{stanley_rmse_mm} mm",
+        "drove on time; it had {nominal_mppi_rmse_mm} mm",
+        "at most {worst_m} m from its path",
     ):
         assert words.format(**small) in prose["your-vehicle"]
     assert limit in prose["failures"]

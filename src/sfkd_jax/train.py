@@ -11,16 +11,20 @@ from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.run import Run
+from sfkd_jax.experiment.systems import train_system
 from sfkd_jax.report.run import write_report
 
 
 def main(run: Run) -> dict[str, Any]:
     """Make data, policy, certificate, closed-loop results and report of a run.
 
-    A vehicle without a step function is not evaluated in closed loop. With
+    With `system` it certifies a system of the user, see `certify_system`. A vehicle
+    without a step function is not evaluated in closed loop. With
     `evaluation.systems=[]` the model is trained and nothing else is done, as a search
     needs it.
     """
+    if run.settings.system is not None:
+        return train_system(run.settings)
     began = time.perf_counter()
     stages.check_settings(run)
     with store.locked(run.directory):

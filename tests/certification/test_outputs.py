@@ -22,7 +22,11 @@ from sfkd_jax.certification._metric_claims import (
     require_output_metric,
     size_of,
 )
-from sfkd_jax.certification._metrics import accepted_metric, propose_metric
+from sfkd_jax.certification._metrics import (
+    accepted_metric,
+    propose_metric,
+)
+from sfkd_jax.certification._search import prove_claims
 from sfkd_jax.certification._tubes import radii
 from sfkd_jax.certification._weights import exported
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
@@ -152,6 +156,22 @@ def proposed(name="position"):
     return propose_metric(
         weights, readouts(weights, PATH_FRAME)[name], worst_gaps(measured())
     )
+
+
+def test_multipliers_that_prove_nothing_do_not_stop_the_search():
+    """Those of the weights are about the residual alone; a proof has better ones."""
+    weights = trained()[1]
+    useless = tuple(1e-9 * part for part in weights.residual_multipliers)
+    readout = readouts(weights, PATH_FRAME)["position"]
+    joint = prove_claims(weights, PATH_FRAME).witnesses.joint
+    start = np.eye(readout.shape[1]), joint
+    gaps = worst_gaps(measured())
+    bad = weights._replace(residual_multipliers=useless)
+    with pytest.raises(CertificationRefused, match="no metric"):
+        propose_metric(bad, readout, gaps)
+    found = propose_metric(bad, readout, gaps, [start])
+    require_output_metric("position", found, weights, PATH_FRAME)
+    assert found.alpha < 1.0
 
 
 @every_output

@@ -31,7 +31,8 @@ def of(group):
 TOGETHER = {
     "first": "dataset=path training=path comparison=table1 scenario=s1 evaluation=standard",
     "second": "dataset=tiny training=standard comparison=none scenario=s2 export=standard",
-    "third": "training=state_model environment=none scenario=s3 evaluation=benchmark",
+    "third": "training=state_model environment=none scenario=s3 evaluation=benchmark "
+    "tubes=standard",
     "estimated": "environment=estimated comparison=benchmark scenario=obstacles "
     "dataset=path_with_margin",
     "measured": "environment=measured comparison=benchmark_path dataset=standard",

@@ -1,11 +1,21 @@
 """Defaults follow the size and the speed of a vehicle of the user's own."""
 
+from functools import partial
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from composing import composed, settings
 
+from sfkd_jax import assembly
+from sfkd_jax.driving import plants
+from sfkd_jax.driving.corridor import closed_loop
+from sfkd_jax.driving.corridor._margins import delay_margin, linearised
+from sfkd_jax.driving.path_following import derive_path_law
 from sfkd_jax.experiment import scaling
 from sfkd_jax.experiment.options import parse_settings
+from sfkd_jax.settings import arguments
 from sfkd_jax.store import plain
 
 STEP = "vehicle.step=somewhere:step"
@@ -36,19 +46,18 @@ def test_a_car_keeps_every_default_to_the_last_bit():
 
 
 def test_two_vehicles_of_one_shape_have_the_same_problem_in_their_own_units():
-    """Half the length at the same gravity: speeds shrink with the root of it."""
+    """A quarter of the length at the same gravity: speeds shrink with the root of it."""
     small = own(2.7 / 4)
     car = own(2.7)
     length, speed = 0.25, 0.5
     for name, how in scaling.SCALED.items():
         if scaling._get(car, name) is None:
             continue
-        factor = how.factor(scaling.Scale(length, speed, 1.0, 1.0 / length))
+        # Its loop would be twice as fast as that of a car, and is 1/0.6 times as fast.
+        factor = how.factor(scaling.Scale(length, speed, 1.0, 1.0 / length, 1.2))
         theirs = np.asarray(scaling._get(car, name))
         ours = np.asarray(scaling._get(small, name))
         wanted = theirs * factor
-        if how.entry is not None:
-            wanted[1 - how.entry] = theirs[1 - how.entry]
         np.testing.assert_allclose(ours, wanted, rtol=5e-3, err_msg=name)
     drives = small.dataset
     # What has no unit is the same: way of a turn in wavelengths, sharpness of a bend.
@@ -91,7 +100,8 @@ def test_a_car_at_a_tenth_a_truck_and_a_robot_stay_within_their_limits(
         f"vehicle.control_high={high}".replace(" ", ""),
     )
     dataset = f"dataset.speed={list(speed)}".replace(" ", "")
-    drives = own(wheelbase, dataset, limits=words).dataset
+    chosen = own(wheelbase, dataset, limits=words)
+    drives = chosen.dataset
     law = drives.law
     tightest = np.tan(high[0]) / wheelbase
     assert drives.peak_curvature <= tightest / 3
@@ -103,8 +113,62 @@ def test_a_car_at_a_tenth_a_truck_and_a_robot_stay_within_their_limits(
         law.lateral_acceleration / drives.lateral_acceleration, 1.1, rtol=0.02
     )
     assert drives.lateral_acceleration <= 2.0
+    # S3 asks for no more than the class has.
+    roads = chosen.scenario
+    assert roads.speed**2 * roads.peak_curvature <= 1.01 * drives.lateral_acceleration
     # The roads use the curvature that they may have, at some of the speeds.
     assert drives.lateral_acceleration / speed[0] ** 2 >= drives.peak_curvature
+
+
+def delay_margins(law_settings, wheelbase, dt):
+    """How much later the commands of a law may act on a straight road [s], by speed."""
+    share = wheelbase / 2.7
+    bicycle = plants.kinematic(
+        dt=dt, front_length=1.2 * share, rear_length=1.5 * share, drag=0.0
+    )
+    box = {"env_low": (0.8, -1.0), "env_high": (0.9, 1.0)}
+    options = arguments(law_settings, derive_path_law) | box | {"points": (3, 4, 2)}
+    law = jax.jit(partial(derive_path_law, bicycle.nominal, coordinates=3, **options))()
+    # The textbook bicycle, whose tyres do not slip.
+    bicycle = bicycle._replace(step=bicycle.nominal)
+    model = assembly.reference_systems(bicycle, law)["oracle"].model
+    loop = closed_loop(bicycle, model, {}, law, (0.01,) * 4)
+    straight = jnp.asarray([0.0, 0.85, 0.0])
+
+    sharpest = jnp.asarray(0.01 / wheelbase)
+
+    def margin(speed):
+        return delay_margin(linearised(loop, speed, sharpest, straight))
+
+    speeds = jnp.linspace(*law_settings.speed, 4)
+    return dt * np.asarray(jax.jit(partial(jax.lax.map, margin))(speeds))
+
+
+def test_the_law_of_a_small_fast_car_tolerates_a_share_of_the_delay_of_a_car():
+    """Delays are in seconds, and do not shrink with a vehicle."""
+    of_car = delay_margins(own(2.7).dataset.law, 2.7, 0.1)
+    small = own(0.32, SPEED).dataset.law
+    softer = delay_margins(small, 0.32, 0.05)
+    assert np.all(softer >= scaling.FASTEST_LOOP * of_car - 0.005)
+    assert np.all(softer >= 0.06)
+    # Lengths and speeds alone would make its loop faster.
+    stiffer = own(0.32, SPEED, f"dataset.law.curvature={3900 * (0.32 / 2.7) ** 2}")
+    assert np.all(delay_margins(stiffer.dataset.law, 0.32, 0.05) < 0.7 * softer)
+
+
+def test_a_softer_law_has_a_smaller_perturbation_and_there_is_none_without_a_law():
+    small = own(0.32, SPEED).dataset
+    assert small.law.perturbation[0] < 0.02 / 2
+    shares = np.divide(small.steering_excitation, own(2.7).dataset.steering_excitation)
+    # A steady ν moves the vehicle as far as a car, in lengths of its own.
+    np.testing.assert_allclose(shares, small.law.perturbation[0] / 0.02, rtol=5e-3)
+    softness = (small.law.curvature / (3900 * (0.32 / 2.7) ** 2)) ** 0.25
+    np.testing.assert_allclose(softness, 0.6 * 4.0 / 12.0 * 2.7 / 0.32, rtol=5e-3)
+    np.testing.assert_allclose(shares, softness**-2, rtol=5e-3)
+    words = ("vehicle=own", STEP, "vehicle.wheelbase=0.32", *CAR, SPEED)
+    bodies = settings("+experiment=s3_body", *words)
+    in_world = settings("+experiment=s3_body").dataset.steering_excitation
+    assert bodies.dataset.steering_excitation == in_world
 
 
 def test_a_simulator_states_its_speeds_and_its_sensors_follow_its_size():

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,10 @@ from sfkd_jax.certification._weights import (
 )
 from sfkd_jax.types import Polytope
 
+TINY = 1e-12
+"""Smallest multiplier of a start, whose logarithm the search moves."""
+ProvedMetric: TypeAlias = tuple[Matrix, Sequence[Sequence[Any]]]
+"""A metric, and the multipliers of every vertex that prove contraction in it."""
 MARGIN = 1e-6
 """Relative tightening of constraints, which solvers may violate slightly."""
 SHARES = (0.5, 0.75, 0.9)
@@ -182,7 +186,7 @@ def propose_metric(
     weights: Exported,
     readout: Matrix,
     gaps: Float[np.ndarray, "run worst rank"],
-    start: Matrix | None = None,
+    proved: Sequence[ProvedMetric] = (),
 ) -> OutputMetric:
     """Minimise |C|_{P⁻¹} q(|d|_P) / (1 − α_P) over metrics P.
 
@@ -194,8 +198,8 @@ def propose_metric(
         weights: of the model.
         readout: C of the output.
         gaps: d of the worst steps of every run, of a split other than the calibration.
-        start: a Lyapunov matrix of the operators. The search starts there or at I,
-            whichever is better.
+        proved: metrics in which the step contracts. The search starts at the best of
+            these, of I and of the same metrics with the multipliers of the weights.
 
     Raises:
         CertificationRefused: no metric is accepted.
@@ -205,13 +209,19 @@ def propose_metric(
     rank = vertices.shape[-1]
     lower = np.tril_indices(rank)
     entries = len(lower[0])
-    # The search is over logarithms, so that multipliers stay positive.
-    logs = [np.log(np.concatenate([*multipliers, []]))] * len(vertices)
-    factors = [np.eye(rank)]
-    if start is not None:
-        # Scaled to the trace of I, so that both starts have entries of the same size.
-        factors.append(np.linalg.cholesky(start * (rank / np.trace(start))))
-    candidates = [np.concatenate([factor[lower], *logs]) for factor in factors]
+    candidates = []
+    usual = [multipliers] * len(vertices)
+    others = [(metric, usual) for metric, _ in proved]
+    for metric, joint in ((np.eye(rank), usual), *others):
+        # Scaled to the trace of I, so that all starts have entries of the same size.
+        factor = np.linalg.cholesky(metric * (rank / np.trace(metric)))
+        candidates.append(np.concatenate([factor[lower], *map(_logs, joint)]))
+    for metric, joint in proved:
+        # Multipliers scale with P.
+        share = rank / np.trace(metric)
+        factor = np.linalg.cholesky(share * metric)
+        logs = [np.log(share) + _logs(of_vertex) for of_vertex in joint]
+        candidates.append(np.concatenate([factor[lower], *logs]))
 
     def objective(flat: Vector, sharpness: float) -> tuple[float, Vector]:
         loss, gradient = _log_radius(
@@ -225,7 +235,8 @@ def propose_metric(
     # In float64: near α = 1 float32 could not tell the metrics apart.
     with jax.enable_x64(True):
         first_sharpness, _ = SHARPNESS[0]
-        flat = min(candidates, key=lambda point: objective(point, first_sharpness)[0])
+        best = min(candidates, key=lambda point: objective(point, first_sharpness)[0])
+        flat = best
         # From smooth to sharp: a sharp maximum alone would stop at its first kink.
         for sharpness, iterations in SHARPNESS:
             flat = scipy.optimize.minimize(
@@ -236,18 +247,32 @@ def propose_metric(
                 method="L-BFGS-B",
                 options={"maxiter": iterations, "maxcor": 20},
             ).x
-    factor = np.zeros((rank, rank))
-    factor[lower] = flat[:entries]
-    metric = factor @ factor.T
-    # P has the size 1. Multipliers scale with it, or they would prove nothing.
-    scale = 1.0 / size_of(metric)
-    metric *= scale
-    widths = np.cumsum([len(part) for part in multipliers], dtype=int)[:-1]
-    joint = [
-        np.split(scale * np.exp(part), widths) if multipliers else []
-        for part in flat[entries:].reshape(len(vertices), -1)
-    ]
-    return accepted_metric(weights, readout, 0.5 * (metric + metric.T), joint)
+
+    def accepted(flat: Vector) -> OutputMetric:
+        factor = np.zeros((rank, rank))
+        factor[lower] = flat[:entries]
+        metric = factor @ factor.T
+        # P has the size 1. Multipliers scale with it, or they would prove nothing.
+        scale = 1.0 / size_of(metric)
+        metric *= scale
+        widths = np.cumsum([len(part) for part in multipliers], dtype=int)[:-1]
+        joint = [
+            np.split(scale * np.exp(part), widths) if multipliers else []
+            for part in flat[entries:].reshape(len(vertices), -1)
+        ]
+        return accepted_metric(weights, readout, 0.5 * (metric + metric.T), joint)
+
+    try:
+        return accepted(flat)
+    except CertificationRefused:
+        # The search may end where rounding spoils the proof. Where it began is worse,
+        # but proves something.
+        return accepted(best)
+
+
+def _logs(multipliers: Sequence[Any]) -> Vector:
+    """Return logarithms of multipliers, over which the search keeps them positive."""
+    return np.log(np.maximum(np.concatenate([*multipliers, []]), TINY))
 
 
 def accepted_metric(

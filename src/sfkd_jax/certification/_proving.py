@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sfkd_jax.certificate import LyapunovClaim, OutputMetric, Proof
+from sfkd_jax.certificate import Claims, LyapunovClaim, OutputMetric, Proof
 from sfkd_jax.certification._attack import attack_claims
 from sfkd_jax.certification._claims import (
     FLOAT32,
@@ -22,7 +22,11 @@ from sfkd_jax.certification._metric_claims import (
     require_lyapunov,
     require_output_metrics,
 )
-from sfkd_jax.certification._metrics import propose_metric, prove_lyapunov
+from sfkd_jax.certification._metrics import (
+    ProvedMetric,
+    propose_metric,
+    prove_lyapunov,
+)
 from sfkd_jax.certification._search import prove_claims
 from sfkd_jax.certification._weights import (
     CertificateStale,
@@ -85,7 +89,8 @@ def prove(
     outputs = {}
     if validation is not None:
         lyapunov, refused = _lyapunov(larger)
-        outputs = _metrics_of_outputs(model, params, larger, lyapunov, validation)
+        proved = _proved_metrics(larger, claims, lyapunov)
+        outputs = _metrics_of_outputs(model, params, larger, proved, validation)
     return Proof(
         **vars(claims),
         transport_lipschitz=1.0,
@@ -113,11 +118,25 @@ def _lyapunov(weights: Exported) -> tuple[LyapunovClaim | None, str | None]:
         return None, str(reason)
 
 
+def _proved_metrics(
+    weights: Exported, claims: Claims, lyapunov: LyapunovClaim | None
+) -> list[ProvedMetric]:
+    """Return the metrics in which a step is known to contract."""
+    proved: list[ProvedMetric] = []
+    joint = claims.witnesses.joint
+    if claims.alpha_joint < 1.0:
+        identity = np.eye(weights.operators.vertices.shape[-1])
+        proved.append((identity, joint))
+    if lyapunov is not None:
+        proved.append((np.asarray(lyapunov.metric), lyapunov.joint))
+    return proved
+
+
 def _metrics_of_outputs(
     model: Model,
     params: Params,
     weights: Exported,
-    lyapunov: LyapunovClaim | None,
+    proved: list[ProvedMetric],
     validation: Trajectory,
 ) -> dict[str, OutputMetric]:
     """Return a metric for each output that may have one.
@@ -130,10 +149,9 @@ def _metrics_of_outputs(
         return {}
     rows = readouts(weights, model.frame)
     gaps = worst_gaps(residuals(model, fold(model, params, on_host), validation))
-    start = None if lyapunov is None else np.asarray(lyapunov.metric)
     try:
         return {
-            name: propose_metric(weights, rows[name], gaps, start) for name in names
+            name: propose_metric(weights, rows[name], gaps, proved) for name in names
         }
     except CertificationRefused:
         return {}

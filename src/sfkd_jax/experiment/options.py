@@ -21,6 +21,7 @@ from sfkd_jax.driving import drives, simulation
 from sfkd_jax.driving.corridor import measure_corridor
 from sfkd_jax.driving.plants import KNOWN_STATES, Vehicle, described, roles_of
 from sfkd_jax.driving.scenarios import DriveClass
+from sfkd_jax.experiment.tube_settings import TubeSettings
 from sfkd_jax.latency import Latency
 from sfkd_jax.ranges import (
     Bounds,
@@ -311,6 +312,7 @@ class Settings:
     root: str
     optimized: bool
     scaled: bool
+    system: str | None
     vehicle: VehicleSettings
     environment: EnvironmentSettings
     scenario: ScenarioSettings
@@ -321,6 +323,7 @@ class Settings:
     latency: LatencySettings
     certification: CertificationSettings
     evaluation: EvaluationSettings
+    tubes: TubeSettings
     comparison: ComparisonSettings
     export: ExportSettings
     demo: DemoSettings

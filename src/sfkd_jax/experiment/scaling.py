@@ -25,6 +25,10 @@ GENTLE = 0.25
 """Curvature of the class, at most, relative to that of the steering at its limit."""
 IN_RESERVE = 1.5
 """Acceleration that the controls reach, at least, relative to that of the class."""
+FASTEST_LOOP = 0.6
+"""Time constants of a law in seconds, at least, relative to those of a car. Delays do
+not shrink with a vehicle.
+"""
 DIGITS = 3
 """Significant digits of what is derived, so that a line shows what is used."""
 
@@ -37,17 +41,28 @@ class Scale(NamedTuple):
         speed: of its fastest reference.
         acceleration: of its references; at most 1, since grip does not grow with size.
         curvature: of its references.
+        softness: of the time constants of its law, in its own unit of time, length /
+            speed; 1 without a law.
     """
 
     length: float = 1.0
     speed: float = 1.0
     acceleration: float = 1.0
     curvature: float = 1.0
+    softness: float = 1.0
 
     @property
     def curvature_slope(self) -> float:
         """Of dκ/ds."""
         return self.curvature / self.length
+
+    @property
+    def scenario_curvature(self) -> float:
+        """Of the roads of S3, which a car drives at its largest lateral acceleration.
+
+        No road asks for more than the class has.
+        """
+        return min(self.curvature, self.acceleration / self.speed**2)
 
     @property
     def lateral_jerk(self) -> float:
@@ -60,24 +75,29 @@ class Scaled(NamedTuple):
 
     Attributes:
         unit: of the setting.
-        factor: by which the default of a car is multiplied.
-        entry: the entry of a pair of steering and drive that is scaled; None for all.
+        factor: by which the default of a car is multiplied; a pair of them for steering
+            and drive.
     """
 
     unit: str
-    factor: Callable[[Scale], float]
-    entry: int | None = None
+    factor: Callable[[Scale], float | tuple[float, float]]
 
 
 _LENGTH = Scaled("m", lambda scale: scale.length)
 _SPEED = Scaled("m/s", lambda scale: scale.speed)
 _ACCELERATION = Scaled("m/s²", lambda scale: scale.acceleration)
-_DRIVE_ENTRY = _ACCELERATION._replace(entry=1)
+_DRIVE_ENTRY = Scaled("m/s²", lambda scale: (1.0, scale.acceleration))
 _CURVATURE = Scaled("1/m", lambda scale: scale.curvature)
 # Weights are those of squared errors.
 _OF_DISTANCE = Scaled("1/m²", lambda scale: scale.length**-2)
 _OF_SPEED = Scaled("s²/m²", lambda scale: scale.speed**-2)
 _OF_DRIVE = Scaled("s⁴/m²", lambda scale: scale.acceleration**-2)
+# At v the loop of a weight r on the curvature and q on the distance has the time
+# constant (r / q)^¼ / v, and a steady ν moves the vehicle by a way like (r / q)^½.
+_OF_CURVATURE = Scaled("m²", lambda scale: scale.length**2 * scale.softness**4)
+_PERTURBATION = Scaled(
+    "rad, m/s²", lambda scale: (scale.softness**-2, scale.acceleration)
+)
 
 SCALED = {
     "dataset.speed": _SPEED,
@@ -87,17 +107,18 @@ SCALED = {
     "dataset.acceleration": _ACCELERATION,
     "dataset.lateral_jerk": Scaled("m/s³", lambda scale: scale.lateral_jerk),
     "dataset.curvature_slope": Scaled("1/m²", lambda scale: scale.curvature_slope),
+    "dataset.steering_excitation": Scaled("rad", lambda scale: scale.softness**-2),
     "dataset.speed_excitation": _ACCELERATION,
     "dataset.law.speed": _SPEED,
     "dataset.law.lateral_acceleration": _ACCELERATION,
-    "dataset.law.perturbation": _DRIVE_ENTRY,
+    "dataset.law.perturbation": _PERTURBATION,
     "dataset.law.lateral": _OF_DISTANCE,
     "dataset.law.velocity": _OF_SPEED,
-    "dataset.law.curvature": Scaled("m²", lambda scale: scale.length**2),
+    "dataset.law.curvature": _OF_CURVATURE,
     "dataset.law.drive": _OF_DRIVE,
     "training.loss.size": Scaled("-", lambda scale: scale.length),
     "scenario.speed": _SPEED,
-    "scenario.peak_curvature": _CURVATURE,
+    "scenario.peak_curvature": Scaled("1/m", lambda scale: scale.scenario_curvature),
     "scenario.wavelengths": _LENGTH,
     "controller.cost.lateral": _OF_DISTANCE,
     "controller.cost.speed": _OF_SPEED,
@@ -109,12 +130,14 @@ SCALED = {
 }
 """The settings with a default that follows the vehicle, by name."""
 SENSORS = {
-    "p_x": _LENGTH,
-    "p_y": _LENGTH,
-    "v": _SPEED,
-    "v_y": _SPEED,
+    "p_x": "length",
+    "p_y": "length",
+    "v": "speed",
+    "v_y": "speed",
 }
-"""States whose sensors follow the vehicle; those of angles and their rates do not."""
+"""States whose sensors follow the vehicle, and what of `Scale` they follow. Those of
+angles and their rates do not.
+"""
 NOISE = "evaluation.observation_noise"
 """The setting of the sensors, by state."""
 SAME_SPEED = ("dataset.speed", "dataset.law.speed")
@@ -135,6 +158,9 @@ def scaled(settings: Settings, words: Collection[str] = ()) -> Settings:
     typed = _typed_settings(words)
     speed = _stated_speed(settings, typed)
     scale = scale_of(settings.vehicle, speed)
+    if _get(settings, "dataset.law") is None:
+        # What excites the steering is the steering itself there, and not ν.
+        scale = scale._replace(softness=1.0)
     for name, how in SCALED.items():
         value = _get(settings, name)
         if value is None or _is_typed(name, typed):
@@ -142,7 +168,7 @@ def scaled(settings: Settings, words: Collection[str] = ()) -> Settings:
         if name in SAME_SPEED and speed is not None:
             value = speed
         else:
-            value = _times(value, how.factor(scale), how.entry)
+            value = _times(value, how.factor(scale))
         settings = _put(settings, name, value)
     return _put(settings, NOISE, _sensors(settings, scale, typed))
 
@@ -183,9 +209,9 @@ def _sensors(
         is_stated = noise.get(state) is not None or _is_typed(f"{NOISE}.{state}", typed)
         if state not in SENSORS or is_stated:
             continue
-        factor = SENSORS[state].factor(scale)
+        factor: float = getattr(scale, SENSORS[state])
         if factor < 1.0:
-            noise[state] = _times(KNOWN_STATES[state].deviation, factor, None)
+            noise[state] = _times(KNOWN_STATES[state].deviation, factor)
     return noise
 
 
@@ -227,7 +253,8 @@ def scale_of(vehicle: Any, speed: tuple[float, float] | None = None) -> Scale:
     fastest = ratio * CAR_CLASS.speed[1]
     needed = fastest**2 * curvature * CAR_CLASS.peak_curvature
     acceleration = min(acceleration, needed / CAR_CLASS.lateral_acceleration)
-    return Scale(length, ratio, acceleration, curvature)
+    softness = max(1.0, FASTEST_LOOP * ratio / length)
+    return Scale(length, ratio, acceleration, curvature, softness)
 
 
 def _stated_speed(
@@ -266,13 +293,16 @@ def _put(settings: Any, name: str, value: Any) -> Any:
     return replace(settings, **{first: value})
 
 
-def _times(value: Any, factor: float, entry: int | None) -> Any:
-    """Return a number or a pair times a factor, rounded to `DIGITS` digits."""
+def _times(value: Any, factor: float | tuple[float, ...]) -> Any:
+    """Return a number or a pair times a factor, rounded to `DIGITS` digits.
+
+    Args:
+        value: number, or pair.
+        factor: of the number or of both; a pair has one for each.
+    """
+    if isinstance(value, tuple):
+        factors = factor if isinstance(factor, tuple) else (factor,) * len(value)
+        return tuple(_times(*both) for both in zip(value, factors, strict=True))
     if factor == 1.0:
         return value
-    if isinstance(value, tuple):
-        return tuple(
-            _times(part, factor, None) if entry in (None, place) else part
-            for place, part in enumerate(value)
-        )
     return float(f"{value * factor:.{DIGITS}g}")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
-from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,13 @@ from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prov
 from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import fit_planning
+from sfkd_jax.experiment.options import Settings
+from sfkd_jax.experiment.system_runs import compare_system
+from sfkd_jax.experiment.tube_settings import LOGGED, TubeSettings, check_settings
 from sfkd_jax.policy import CERTIFICATE, SystemPolicy, TrainedSystem
-from sfkd_jax.ranges import (
-    AtLeastOne,
-    AtLeastTwo,
-    Fraction,
-    Positive,
-    Span,
-    check_intervals,
-)
+from sfkd_jax.ranges import NonNegativeInt, imported
 from sfkd_jax.rollout import fold, on_host
+from sfkd_jax.settings import parse
 from sfkd_jax.systems import (
     ClosedLoop,
     System,
@@ -59,10 +56,10 @@ SMALLEST_PART = 64
 """Smallest number of segments of a part."""
 FIRST_PART = 10
 """Stream of the random keys of the first part."""
-LOGGED = 50
-"""Steps of the training between two lines of its log."""
 SEGMENT = 60
 """Steps of a segment."""
+COMPARED = 8
+"""Number of runs in which controllers are compared."""
 SPREAD_STEPS = 300
 """Steps of the runs that tell how far the loop moves."""
 PROBES = 4
@@ -84,39 +81,6 @@ LARGEST_RATE = 0.995
 """Largest contraction rate that a model may learn."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class TubeSettings:
-    """How a system is certified.
-
-    Attributes:
-        rate: contraction rate of the law; None for the fastest that hardly saturates.
-        points: of the table of the law, on every axis.
-        perturbation: largest |ν|, relative to half of the range of each control.
-        dwell: range of times between two switches of e [s].
-        segments: share of the data at full size.
-        steps: optimiser steps of the training, a multiple of `LOGGED`.
-        runs: number of runs of each part that calibrates or tests the tubes.
-        duration: of these runs [s].
-        level: 1 − δ.
-        samples: of the planner.
-        horizon: of the planner [steps].
-        seed: of everything.
-    """
-
-    rate: Fraction | None = None
-    points: AtLeastTwo = 5
-    perturbation: Fraction = 0.05
-    dwell: Span = (1.0, 4.0)
-    segments: Positive = 1.0
-    steps: AtLeastOne = 6000
-    runs: AtLeastOne = 300
-    duration: Positive = 30.0
-    level: Fraction = 0.95
-    samples: AtLeastOne = 300
-    horizon: AtLeastOne = 20
-    seed: int = 0
-
-
 @dataclass(frozen=True, eq=False)
 class SystemRun:
     """A system in its run directory.
@@ -127,15 +91,17 @@ class SystemRun:
         tracked: the system in the coordinates of its frame.
         settings: of the run.
         directory: of the run.
+        seed: of everything that is drawn.
     """
 
     tracked: Tracked
     settings: TubeSettings
     directory: Path
+    seed: int
 
     def key(self, stream: int) -> Key:
         """Return the random key of one use."""
-        return jax.random.fold_in(jax.random.key(self.settings.seed), stream)
+        return jax.random.fold_in(jax.random.key(self.seed), stream)
 
     @cached_property
     def loop(self) -> ClosedLoop:
@@ -192,6 +158,7 @@ class SystemRun:
             {
                 **policy.describe_system(self.tracked),
                 "settings": vars(self.settings),
+                "seed": self.seed,
                 # Of a function nothing but its values can be compared.
                 "step": [[float(f"{value:.4g}") for value in row] for row in probes],
             }
@@ -326,7 +293,12 @@ class SystemRun:
 
 
 def certify_system(
-    system: System, frame: Tracking, *, root: str | Path, **settings: Any
+    system: System,
+    frame: Tracking,
+    *,
+    root: str | Path,
+    seed: NonNegativeInt = 0,
+    **settings: Any,
 ) -> SystemPolicy:
     """Return a policy of a system with its certificate; everything is kept in `root`.
 
@@ -338,6 +310,7 @@ def certify_system(
         system: its step, which jax differentiates.
         frame: what it follows, see `tracking` and `regulation`.
         root: directory of the run.
+        seed: of everything that is drawn.
         settings: fields of `TubeSettings`.
 
     Raises:
@@ -346,12 +319,12 @@ def certify_system(
         CertificationRefused: the model could not be certified.
         ArtefactError: the directory has a run of another system or other settings.
     """
-    parsed = TubeSettings(**settings)
-    _check(parsed, system)
+    parsed = parse(TubeSettings, settings, "tubes.")
+    check_settings(parsed, system.dt)
     tracked = Tracked(system, frame)
-    system.check_step()
+    system.check_step(tracked.state(jnp.zeros(len(tracked.names)), tracked.middle))
     tracked.check_invariance(jax.random.key(0))
-    run = SystemRun(tracked, parsed, Path(root))
+    run = SystemRun(tracked, parsed, Path(root), seed)
     with store.locked(run.directory):
         trained = run.trained()
         path = run.directory / CERTIFICATE
@@ -362,37 +335,61 @@ def certify_system(
     return policy.load_system(run.directory)
 
 
-def _check(settings: TubeSettings, system: System) -> None:
-    """Raise a ValueError for settings with which nothing could be certified."""
-    check_intervals(settings)
-    if settings.dwell[0] > settings.dwell[1]:
-        raise ValueError(f"dwell must be ascending, got {settings.dwell}")
-    if settings.steps % LOGGED:
-        raise ValueError(f"steps must be a multiple of {LOGGED}, got {settings.steps}")
-    if settings.duration < system.dt:
-        raise ValueError(
-            f"duration must be a sampling period of {system.dt:g} s at least, "
-            f"got {settings.duration:g}"
-        )
-    needed = ceil(settings.level / (1.0 - settings.level))
-    if settings.runs < needed:
-        raise ValueError(
-            f"runs must be {needed} at least for a level of {settings.level:g}, "
-            f"got {settings.runs}"
-        )
-
-
 def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:
     """Return what the step does at a few places."""
     low, high = map(jnp.asarray, tracked.system.control_box)
     bottom, top = map(jnp.asarray, tracked.system.env_box)
-    size = len(tracked.names)
+    middle = tracked.state(jnp.zeros(len(tracked.names)), tracked.middle)
 
     def probe(key: Key) -> Array:
         state_key, control_key, env_key = jax.random.split(key, 3)
-        state = 0.3 * jax.random.normal(state_key, (size,))
+        state = middle + 0.3 * jax.random.normal(state_key, middle.shape)
         control = jax.random.uniform(control_key, low.shape, minval=low, maxval=high)
         env = jax.random.uniform(env_key, bottom.shape, minval=bottom, maxval=top)
         return tracked.system.step(state, control, env)
 
     return jax.vmap(probe)(jax.random.split(key, PROBES))
+
+
+def train_system(settings: Settings) -> dict[str, Any]:
+    """Certify the system that the settings of a command name, and compare it.
+
+    Args:
+        settings: of the command; `system` is package.module:function, which returns a
+            `System` and a `Tracking`.
+
+    Raises:
+        ValueError: the function does not return these.
+    """
+    began = time.perf_counter()
+    make = imported(str(settings.system), "system")
+    if not callable(make) or inspect.signature(make).parameters:
+        raise ValueError(f"system={settings.system} must be a function of no arguments")
+    made: Any = make()
+    is_pair = isinstance(made, tuple) and len(made) == 2
+    if not (is_pair and isinstance(made[0], System) and isinstance(made[1], Tracking)):
+        raise ValueError(
+            f"system={settings.system} must return a System and what it follows, as "
+            f"sfkd_jax.tracking returns it; got {type(made).__name__}"
+        )
+    system, frame = made
+    directory = Path(settings.root) / settings.name
+    certified = certify_system(
+        system, frame, root=directory, seed=settings.seed, **vars(settings.tubes)
+    )
+    store.print_message(str(certified))
+    compared = compare_system(certified, system, runs=COMPARED)
+    tubes = certified.certificate.tubes
+    result = {
+        "run": str(directory),
+        "system": system.name,
+        "states": len(system.states),
+        "alpha": certified.certificate.proof.alpha,
+        "outputs": {name: vars(bounds) for name, bounds in tubes.outputs.items()},
+        "coverage": tubes.coverage.share,
+        "coverage_ci95": list(tubes.coverage.ci95),
+        **compared,
+        "seconds": time.perf_counter() - began,
+    }
+    store.write_json(directory / "comparison.json", result)
+    return result

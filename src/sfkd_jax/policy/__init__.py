@@ -6,21 +6,19 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from sfkd_jax import assembly, store
 from sfkd_jax.certificate import describe_signature
 from sfkd_jax.driving.certificate import DrivingCertificate
-from sfkd_jax.driving.lanes import padded
 from sfkd_jax.driving.path_following import in_the_world
 from sfkd_jax.driving.plants import FRICTION, roles_of
-from sfkd_jax.geometry import relative, shifted
 from sfkd_jax.latency import NO_LATENCY, Latency
+from sfkd_jax.policy._calling import entrance, with_capacity
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
 from sfkd_jax.policy._certificate import RECORDED as RECORDED
 from sfkd_jax.policy._certificate import read_certificate as read_certificate
@@ -49,7 +47,7 @@ from sfkd_jax.policy._trained import restore as restore
 from sfkd_jax.policy._trained import save as save
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
-from sfkd_jax.types import Controller, Key, Params
+from sfkd_jax.types import Controller, Params
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +108,7 @@ class Policy(TrainedModel):
         with jax.ensure_compile_time_eval():
             if not along_path:
                 planner = in_the_world(planner)
-            return _entrance(self.around(planner=planner), self)
+            return entrance(self.around(planner=planner), self)
 
     def in_lane(
         self,
@@ -155,7 +153,7 @@ class Policy(TrainedModel):
                 friction=roles.index(FRICTION) if FRICTION in roles else None,
             )
         if capacity is not None:
-            controller = _with_capacity(controller, capacity)
+            controller = with_capacity(controller, capacity)
         return in_policy_numerics(controller)
 
     def __reduce__(self) -> Any:
@@ -209,6 +207,18 @@ def load(
         if controller or latency or adaptive or signed_by or env_source != "measured":
             raise ValueError(f"{path} is the policy of a system: load it by path alone")
         return load_system(path)
+    return _load_vehicle(path, controller, env_source, adaptive, latency, signed_by)
+
+
+def _load_vehicle(
+    path: str | Path,
+    controller: Mapping[str, Any] | None,
+    env_source: str,
+    adaptive: bool,
+    latency: Latency | None,
+    signed_by: str | Path | None,
+) -> Policy:
+    """Return the policy of a vehicle; see `load`."""
     file = policy_file(path)
     trained = restore(path)
     # Here, so that a certificate is checked on the weights that will be multiplied.
@@ -249,11 +259,11 @@ def load(
     if certificate is not None:
         signature = describe_signature(certificate.sha256, certificate.signature)
     else:
-        # 3: `policy_numerics` stands between this function and its caller.
-        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=3)
+        # 4: `load` and `policy_numerics` stand between this function and the caller.
+        warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=4)
     return Policy(
         **vars(replace(trained, settings=_stating(settings, latency))),
-        controller=_entrance(planner, trained),
+        controller=entrance(planner, trained),
         certificate=certificate,
         signature=signature,
         around=around,
@@ -319,72 +329,3 @@ def _check_env_source(env_source: str, reads_env: bool) -> None:
             f"env_source must be {' or '.join(sources)} for a policy that "
             f"{'reads' if reads_env else 'ignores'} the environment, got {env_source!r}"
         )
-
-
-def _with_capacity(controller: Controller, capacity: tuple[int, int]) -> Controller:
-    """Return a controller in a lane that is compiled once for all numbers of obstacles.
-
-    Args:
-        controller: in a lane.
-        capacity: number of obstacles, and of predicted positions of each.
-    """
-    if len(capacity) != 2 or min(capacity) < 1:
-        raise ValueError(
-            "capacity must be (obstacles, predicted positions), both 1 or more, "
-            f"got {capacity}"
-        )
-    compiled = jax.jit(controller.act)
-
-    @wraps(controller.act)
-    def act(params: Params, state: Any, observation: Any, env: Any, scene: Any) -> Any:
-        lane, obstacles = scene
-        rows = padded(obstacles, *capacity)
-        return compiled(params, state, observation, env, (lane, rows))
-
-    return Controller(jax.jit(controller.init), act)
-
-
-def _entrance(controller: Controller, trained: TrainedModel) -> Controller:
-    """Return the same controller, with `policy_numerics` and a check of its arguments.
-
-    Positions in double precision are made relative before anything is float32.
-    """
-    names = trained.vehicle.state_names
-    shape = (len(names),)
-    env_shape = (len(trained.settings["space"]["env_mean"]),)
-    # One program, where every array of the state would otherwise be one.
-    compiled = jax.jit(controller.init)
-
-    @wraps(controller.init)
-    def init(key: Key) -> Any:
-        if not trained.model.frame.has_pose and jax.debug_nans.value:
-            raise ValueError(
-                "jax_debug_nans: controllers along a path keep NaN for what is not "
-                "known yet; switch it off"
-            )
-        return compiled(key)
-
-    @wraps(controller.act)
-    def act(
-        params: Params, state: Any, observation: Any, env: Any, reference: Any
-    ) -> Any:
-        # Broadcasting would accept some, and others fail far from here.
-        if jnp.shape(observation) != shape:
-            raise ValueError(
-                f"observation must have shape {shape}: {', '.join(names)}; "
-                f"got {jnp.shape(observation)}"
-            )
-        if jnp.shape(env) != env_shape:
-            raise ValueError(f"env must have shape {env_shape}, got {jnp.shape(env)}")
-        near, ahead, origin = relative(observation, reference)
-        moved = near is not observation
-        control, state, info = controller.act(
-            params, state, jnp.asarray(near), env, jnp.asarray(ahead)
-        )
-        if moved:
-            # What is reported is in the world again, on the host in float64.
-            states = shifted(info.plan.states, origin)
-            info = info._replace(plan=info.plan._replace(states=states))
-        return control, state, info
-
-    return in_policy_numerics(Controller(init, act))

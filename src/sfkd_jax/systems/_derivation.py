@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -207,7 +209,10 @@ def _solution(
     effort = sum(cp.trace(Z) for Z in Zs) / corners
     problem = cp.Problem(cp.Minimize(effort), [*conditions])
     try:
-        problem.solve(solver=cp.CLARABEL)
+        with warnings.catch_warnings():
+            # No warning about an inaccurate answer: the rates are computed.
+            warnings.simplefilter("ignore")
+            problem.solve(solver=cp.CLARABEL)
     except cp.SolverError:
         return None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):

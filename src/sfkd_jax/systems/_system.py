@@ -109,23 +109,26 @@ class System:
         """Standard deviations of the sensors, one for each state."""
         return tuple(state.deviation for state in self.state_variables)
 
-    def check_step(self) -> None:
+    def check_step(self, state: State) -> None:
         """Raise a ValueError unless the step returns a finite state in the middle of E.
 
-        The state is 0, and so are the controls as far as their limits allow.
+        The controls are 0, as far as their limits allow.
+
+        Args:
+            state: at which the step is tried.
         """
         size = len(self.states)
         low, high = self.control_box
         control = jnp.clip(jnp.zeros(len(low)), jnp.asarray(low), jnp.asarray(high))
         env = jnp.mean(jnp.asarray(self.env_box), axis=0)
-        after = jnp.asarray(self.step(jnp.zeros(size), control, env))
+        after = jnp.asarray(self.step(state, control, env))
         if after.shape != (size,):
             raise ValueError(
                 f"the step must return a state of shape ({size},): "
                 f"{', '.join(self.state_names)}; got {after.shape}"
             )
         if not np.all(np.isfinite(after)):
-            raise ValueError(f"the step from a state of zeros is not finite: {after}")
+            raise ValueError(f"the step from the state {state} is not finite: {after}")
 
 
 def integrated(

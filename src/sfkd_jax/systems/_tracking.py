@@ -86,6 +86,11 @@ class Tracked:
         """Entries of the state that the reference has."""
         return tuple(self.names.index(state) for state in self.frame.chained)
 
+    @property
+    def middle(self) -> ReferenceState:
+        """The reference in the middle of its ranges, and 0 without a range."""
+        return self._reference_of(jnp.mean(jnp.asarray(self.frame.input_box), axis=0))
+
     @cached_property
     def rows(self) -> dict[str, tuple[int, ...]]:
         """Entries of ξ of each output."""
@@ -213,8 +218,7 @@ class Tracked:
 
         # In float64: a difference may be small beside the states that are subtracted.
         with jax.enable_x64(True):
-            inputs = jnp.mean(jnp.asarray(self.frame.input_box), axis=0)
-            middle = self._reference_of(inputs)
+            middle = self.middle
             places = jax.vmap(self._place)(jax.random.split(key, PLACES))
             along = jax.jit(jax.vmap(moved, in_axes=(0, None)))
             start = along(places, middle)

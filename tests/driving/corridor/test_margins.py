@@ -91,3 +91,48 @@ def test_twice_the_gain_halves_what_a_law_tolerates():
     assert np.all(np.asarray(usual.delay_s) < 0.4)
     assert np.all(np.abs(ratio - 0.5) < 0.15)
     assert np.all(np.asarray(strong.noise_steering) > np.asarray(usual.noise_steering))
+
+
+def seen_and_hidden_servo(share=4.0):
+    """One car with a servo twice: the angle is a state that is measured, or hidden."""
+    law = any_law()
+    law = law._replace(gain=share * law.gain)
+    seen = plants.with_servo(plants.kinematic(), lag=0.3)
+    hidden = seen._replace(states=seen.states[:-1], hidden=1)
+    # The law that sees the angle does not read it.
+    reading_all = law._replace(
+        state=jnp.concatenate([law.state, law.control[..., :1]], axis=-1),
+        gain=jnp.pad(law.gain, [(0, 0)] * (law.gain.ndim - 1) + [(0, 1)]),
+    )
+    model = assembly.reference_systems(plants.kinematic(), law)["oracle"].model
+    return (
+        closed_loop(seen, model, {}, reading_all, (0.01,) * 5),
+        closed_loop(hidden, model, {}, law, (0.01,) * 4),
+    )
+
+
+STRAIGHT = {
+    "lateral_acceleration": 0.01,
+    "peak_curvature": 0.0001,
+    "speed": (8.0, 10.5),
+    "env_low": (0.8, -0.01),
+    "env_high": (0.81, 0.01),
+}
+
+
+def test_a_hidden_state_is_part_of_the_margins():
+    seen, hidden = seen_and_hidden_servo()
+    expected = law_margins(seen, STRAIGHT)
+    found = law_margins(hidden, STRAIGHT)
+    assert expected is not None
+    assert found is not None
+    assert max(found.delay_s) < 0.5
+    np.testing.assert_allclose(found.delay_s, expected.delay_s, atol=0.011)
+    np.testing.assert_allclose(
+        found.noise_lateral_m, expected.noise_lateral_m, rtol=0.02
+    )
+
+
+def test_a_law_that_does_not_hold_the_vehicle_has_no_margins_and_no_fault():
+    for loop in seen_and_hidden_servo(share=-40.0):
+        assert law_margins(loop, STRAIGHT) is None

@@ -258,7 +258,8 @@ class Corridor:
         shield_horizon: preview of the shield [steps].
         seconds: that the measurements took [s].
         recorded: corridor of recorded runs of the car, or None.
-        margins: of the law; None in certificates from before they were measured.
+        margins: of the law; None where it does not stabilise a turn of its class, and
+            in certificates from before they were measured.
         late_sensors: of vehicles whose sensors are all later, by rising delays.
         late_controls: of vehicles whose controls are all later. They know e before
             their commands act as well.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from sfkd_jax.driving.certificate import LawMargins
 from sfkd_jax.driving.corridor._closed_loop import Loop, spread_of
 from sfkd_jax.driving.path_coordinates import LATERAL
-from sfkd_jax.driving.path_following import by_differences, expected_coordinates
+from sfkd_jax.driving.path_following import by_differences
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.types import BODY
 
@@ -32,6 +32,10 @@ SPEEDS = 13
 """Points of the grid on the axis of v_ref."""
 CONDITIONS = 3
 """Points of the grid on each axis of e."""
+SETTLING = 80
+"""Steps of the closed loop after which hidden states have settled."""
+HELD = 0.1
+"""Lateral error up to which the law holds a vehicle on its path [wheelbases]."""
 
 
 class Linearisation(NamedTuple):
@@ -42,10 +46,11 @@ class Linearisation(NamedTuple):
     K: Float[Array, "2 coordinate"]
 
 
-def law_margins(loop: Loop, data: Mapping[str, Any]) -> LawMargins:
+def law_margins(loop: Loop, data: Mapping[str, Any]) -> LawMargins | None:
     """Return the margins of a law at some speeds: the least over turns and e.
 
-    They rest on a grid and on linearisations, and are no proof.
+    They rest on a grid and on linearisations, and are no proof. There are none if the
+    law does not stabilise all of them, since the noise grows without a limit there.
 
     Args:
         loop: of plant and law.
@@ -60,6 +65,7 @@ def law_margins(loop: Loop, data: Mapping[str, Any]) -> LawMargins:
     axes = np.meshgrid(shares, *envs, indexing="ij")
     turns = jnp.asarray(np.stack(axes, axis=-1).reshape(-1, len(axes)), jnp.float32)
     spread = spread_of(loop.noise, loop.law.gain.shape[-1] + BODY.start)[BODY]
+    spread = jnp.pad(spread, (0, loop.plant.hidden))
 
     def at_speed(v: Array) -> tuple[Array, ...]:
         sharpest = jnp.minimum(
@@ -78,6 +84,8 @@ def law_margins(loop: Loop, data: Mapping[str, Any]) -> LawMargins:
         )
 
     columns = jax.jit(partial(jax.lax.map, at_speed))(jnp.asarray(speeds, jnp.float32))
+    if not np.isfinite(columns).all():
+        return None
     delays, lows, highs, lateral, steering = (
         tuple(np.asarray(column, float).tolist()) for column in columns
     )
@@ -96,7 +104,8 @@ def linearised(
 ) -> Linearisation:
     """Linearise plant and law at a steady turn, by differences.
 
-    In place of a plant with hidden states its model is linearised.
+    A plant with hidden states is linearised where the closed loop settles. The law
+    reads none of them.
 
     Args:
         loop: of the policy.
@@ -108,23 +117,28 @@ def linearised(
     curvature = turn[0] * sharpest
     road = jnp.stack([curvature, speed])
     steady = loop.law.turn(curvature, speed, env)
-    size = steady.state.shape[0]
+    hidden = loop.plant.hidden
+    xi = jnp.pad(steady.state, (0, hidden))
+    gain = jnp.pad(steady.gain, ((0, 0), (0, hidden)))
+    nothing = jnp.zeros(2)
 
     def advance(turn: Array) -> Array:
-        xi, nu = jnp.split(turn, [size])
-        # A turn is not steady in states that nobody knows; the model has no others.
-        if loop.plant.hidden:
-            model = loop.model.predicting
-            fiber = model.fiber(loop.params, env)
-            return expected_coordinates(model, fiber, xi, nu, road)
+        before, nu = jnp.split(turn, [xi.shape[0]])
         inputs = jnp.concatenate([nu, road])
-        return loop.plant.step(without_pose(xi), inputs, env)[BODY]
+        return loop.plant.step(without_pose(before), inputs, env)[BODY]
 
+    if hidden:
+        # A steady turn says nothing of them.
+        xi = jax.lax.fori_loop(
+            0, SETTLING, lambda _, now: advance(jnp.append(now, nothing)), xi
+        )
+        # Beside the path the actuators may be at their limits, where all is stable.
+        held = jnp.abs(xi[LATERAL]) <= HELD * loop.plant.wheelbase
+        xi = jnp.where(held, xi, jnp.nan)
     # Of the closed loop, whose inputs are ν: A − B K and B.
-    at = jnp.concatenate([steady.state, jnp.zeros(2)])
-    _, slopes = by_differences(advance, at)
-    closed, B = jnp.split(slopes, [size], axis=1)
-    return Linearisation(closed + B @ steady.gain, B, steady.gain)
+    _, slopes = by_differences(advance, jnp.concatenate([xi, nothing]))
+    closed, B = jnp.split(slopes, [xi.shape[0]], axis=1)
+    return Linearisation(closed + B @ gain, B, gain)
 
 
 def rate(matrix: Float[Array, "n n"]) -> Float[Array, ""]:

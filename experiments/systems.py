@@ -1,0 +1,106 @@
+"""What experiments/systems.sh finds: systems that are no cars, certified and compared.
+
+    python -m experiments.systems ROOT [--small] [NAME ...]
+
+Every system of examples/systems is certified in ROOT/NAME, which is continued where it
+stopped, and then driven beside its law, an oracle and a nominal model. Its line of JSON
+is printed and kept in ROOT/NAME/line.json, that of --small in small.json.
+"""
+
+import argparse
+import json
+import runpy
+import time
+from pathlib import Path
+
+from benchmarks import stamp
+from sfkd_jax.certification import CertificationRefused
+from sfkd_jax.experiment.system_runs import compare_system
+from sfkd_jax.experiment.systems import certify_system
+from sfkd_jax.systems import NoLaw
+
+EXAMPLES = Path(__file__).parents[1] / "examples" / "systems"
+SYSTEMS = tuple(sorted(file.stem for file in EXAMPLES.glob("*.py")))
+SMALL = {"steps": 500, "segments": 0.3, "runs": 60, "duration": 10.0}
+"""Settings of `certify_system` in small size; in full size they are its defaults."""
+SMALL_SYSTEMS = "quadrotor", "cart_pole"
+SMALL_COMPARISON = {"runs": 4, "duration": 10.0}
+"""Settings of `compare_system` in small size."""
+DIGITS = 4
+"""Significant digits of the numbers of a line."""
+
+
+def rounded(value):
+    """A document whose numbers have few digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {name: rounded(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(entry) for entry in value]
+    return value
+
+
+def line_of(name, directory, *, settings, comparison):
+    """Certify a system, compare its policy, and return its line.
+
+    Args:
+        name: of the example.
+        directory: of the run.
+        settings: of `certify_system`.
+        comparison: settings of `compare_system`.
+    """
+    began = time.perf_counter()
+    system, frame = runpy.run_path(str(EXAMPLES / f"{name}.py"))["make"]()
+    line = {"system": name, "states": len(system.states)}
+    try:
+        policy = certify_system(system, frame, root=directory, **settings)
+    except (NoLaw, CertificationRefused) as reason:
+        return line | {"refused": str(reason)}
+    minutes = (time.perf_counter() - began) / 60.0
+    tubes = policy.certificate.tubes
+    units = policy.model.frame.units
+    return {
+        **line,
+        "alpha": policy.certificate.proof.alpha,
+        "tube": {output: bound.tube for output, bound in tubes.outputs.items()},
+        "total": {output: bound.total for output, bound in tubes.outputs.items()},
+        "law": {output: bound.system for output, bound in tubes.outputs.items()},
+        "unit": {output: units[output] for output in tubes.outputs},
+        "coverage": tubes.coverage.share,
+        "coverage_ci95": tubes.coverage.ci95,
+        **compare_system(policy, system, **comparison),
+        # Of the certificate, if it was not interrupted.
+        "minutes": minutes,
+    }
+
+
+def main():
+    """Print a line for every system."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("root", type=Path, help="folder of the runs")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(SYSTEMS)}")
+    parser.add_argument("--small", action="store_true", help="two systems, small sizes")
+    given = parser.parse_intermixed_args()
+    names = given.names or (SMALL_SYSTEMS if given.small else SYSTEMS)
+    if unknown := set(names) - set(SYSTEMS):
+        parser.error(f"{', '.join(unknown)}: systems are {', '.join(SYSTEMS)}")
+    for name in names:
+        directory = given.root / name
+        file = directory / ("small.json" if given.small else "line.json")
+        if not file.is_file():
+            line = line_of(
+                name,
+                directory,
+                settings=SMALL if given.small else {},
+                comparison=SMALL_COMPARISON if given.small else {},
+            )
+            directory.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(rounded(line) | stamp()), "utf-8")
+        print(file.read_text("utf-8"), flush=True)
+
+
+if __name__ == "__main__":
+    main()

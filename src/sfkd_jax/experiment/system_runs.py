@@ -1,0 +1,223 @@
+"""Runs of a certified system beside its law, an oracle and a nominal model."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sfkd_jax.control import size_of
+from sfkd_jax.info import ControllerInfo
+from sfkd_jax.models import physics
+from sfkd_jax.policy import SystemPolicy, planner_of
+from sfkd_jax.ranges import AtLeastOne, Positive
+from sfkd_jax.schedules import random_switching
+from sfkd_jax.systems import ClosedLoop, Following, System, Tracked, random_reference
+from sfkd_jax.types import Control, Controller, Environment, Key, Params, State
+
+
+class Scene(NamedTuple):
+    """What a run is driven through.
+
+    Attributes:
+        reference: states of the reference, horizon steps longer than the run.
+        envs: e of every step.
+        noise: of the sensors, at every step.
+    """
+
+    reference: Float[Array, "point reference"]
+    envs: Float[Array, "time environment"]
+    noise: Float[Array, "time state"]
+
+
+class SystemRuns(NamedTuple):
+    """Simulated runs of a controller.
+
+    Attributes:
+        errors: |y| of each output, (run, time, output).
+        bounds: what was claimed of it; NaN without a claim.
+    """
+
+    errors: Float[Array, "run time output"]
+    bounds: Float[Array, "run time output"]
+
+    @property
+    def claimed(self) -> Bool[np.ndarray, "run time"]:
+        """Whether something was claimed."""
+        return np.asarray(jnp.isfinite(self.bounds).all(axis=-1))
+
+    @property
+    def beyond(self) -> int:
+        """Number of steps in which an output was beyond what was claimed."""
+        exceeded = np.asarray(self.errors > self.bounds)
+        return int(np.sum(exceeded.any(axis=-1) & self.claimed))
+
+    def rmse(self, output: int = 0) -> float:
+        """Return the root of the mean square of an output, in its unit."""
+        errors = np.asarray(self.errors, np.float64)[..., output]
+        return float(np.sqrt(np.mean(errors**2)))
+
+
+def random_scenes(
+    policy: SystemPolicy, key: Key, *, runs: AtLeastOne, duration: Positive
+) -> Scene:
+    """Draw scenes of the class that a certificate is about.
+
+    Args:
+        policy: whose certificate states the class.
+        key: consumed.
+        runs: number of scenes.
+        duration: of each [s].
+    """
+    tracked = policy.loop.tracked
+    system = tracked.system
+    steps = round(duration / system.dt)
+    low, high = system.env_box
+    dwell = policy.certificate.tubes.conditions.env_dwell_s
+
+    def scene(key: Key) -> Scene:
+        reference_key, env_key, noise_key = jax.random.split(key, 3)
+        reference = random_reference(
+            tracked, reference_key, steps=steps + policy.horizon
+        )
+        shape = (steps, len(tracked.names))
+        return Scene(
+            reference=reference.points,
+            envs=random_switching(
+                env_key, steps=steps, dt=system.dt, low=low, high=high, dwell=dwell
+            ),
+            noise=jnp.asarray(system.sensor_noise)
+            * jax.random.normal(noise_key, shape),
+        )
+
+    return jax.jit(jax.vmap(scene))(jax.random.split(key, runs))
+
+
+def run_controller(
+    policy: SystemPolicy,
+    step: Any,
+    controller: Controller,
+    params: Params,
+    scenes: Scene,
+    key: Key,
+) -> SystemRuns:
+    """Simulate a controller in the scenes, each from its steady state.
+
+    Args:
+        policy: whose frame, law and outputs are used.
+        step: of the system, in its own states.
+        controller: see `SystemPolicy.controller`.
+        params: of the controller.
+        scenes: of `random_scenes`.
+        key: of the controllers; consumed.
+    """
+    tracked = policy.loop.tracked
+    rows = list(tracked.rows.values())
+
+    def run(params: Params, scene: Scene, key: Key) -> SystemRuns:
+        start = _start(policy.loop, scene)
+
+        def advance(carry: Any, at: Any) -> tuple[Any, tuple[Array, Array]]:
+            state, inner = carry
+            index, env, noise = at
+            window = jax.lax.dynamic_slice_in_dim(
+                scene.reference, index, policy.horizon + 1
+            )
+            control, inner, info = controller.act(
+                params, inner, state + noise, env, window
+            )
+            error = tracked.coordinates(state, window[0])
+            errors = jnp.stack([size_of(error, entries) for entries in rows])
+            bounds = jnp.broadcast_to(jnp.asarray(info.claim.bound), errors.shape)
+            return (step(state, control, env), inner), (errors, bounds)
+
+        steps = jnp.arange(len(scene.envs))
+        carry = (start, controller.init(key))
+        _, recorded = jax.lax.scan(advance, carry, (steps, scene.envs, scene.noise))
+        return SystemRuns(*recorded)
+
+    keys = jax.random.split(key, len(scenes.envs))
+    return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))(params, scenes, keys)
+
+
+def compare_system(
+    policy: SystemPolicy,
+    system: System,
+    *,
+    runs: AtLeastOne = 16,
+    duration: Positive = 30.0,
+    seed: int = 1,
+) -> dict[str, Any]:
+    """Return how a policy drives its system, beside three other controllers.
+
+    All meet the same scenes. "law" is the law alone. "oracle" is the planner of the
+    policy with the true closed loop in place of the model. "nominal" is the same with e
+    in the middle of its box, for law and model alike.
+
+    Args:
+        policy: of the system.
+        system: with its step.
+        runs: number of scenes.
+        duration: of each [s].
+        seed: of the scenes.
+    """
+    tracked = Tracked(system, policy.loop.tracked.frame)
+    loop = ClosedLoop(tracked, policy.loop.law)
+    scene_key, drive_key = jax.random.split(jax.random.key(seed))
+    scenes = random_scenes(policy, scene_key, runs=runs, duration=duration)
+    true_loop = physics(loop.step, frame=policy.model.frame)
+    oracle = Following(
+        inner=planner_of(policy, true_loop), tracked=tracked
+    ).controller()
+    drive = partial(run_controller, policy, system.step, scenes=scenes, key=drive_key)
+    own = drive(controller=policy.controller, params=policy.params)
+    others = {
+        "law": _law_alone(loop),
+        "oracle": oracle,
+        "nominal": _in_usual_env(oracle, system),
+    }
+    result: dict[str, Any] = {
+        "rmse": own.rmse(),
+        "beyond": own.beyond,
+        "claimed": float(own.claimed.mean()),
+    }
+    for name, controller in others.items():
+        result[f"rmse_{name}"] = drive(controller=controller, params={}).rmse()
+    return result
+
+
+def _start(loop: ClosedLoop, scene: Scene) -> State:
+    """Return the state of a system that follows the reference of a scene."""
+    tracked = loop.tracked
+    rates = tracked.rates_between(scene.reference[:2])[0]
+    inputs = tracked.inputs(scene.reference[0], rates)
+    return tracked.state(loop.law.at(inputs, scene.envs[0]).state, scene.reference[0])
+
+
+def _law_alone(loop: ClosedLoop) -> Controller:
+    """Return the law as a controller of the system."""
+
+    def act(
+        params: Params, state: Any, error: Array, env: Environment, inputs: Array
+    ) -> tuple[Control, Any, ControllerInfo]:
+        steady = loop.law.at(inputs[0], env)
+        return loop.limited(steady.feedback(error)), state, ControllerInfo()
+
+    inner = Controller(lambda key: (), act)
+    return Following(inner=inner, tracked=loop.tracked).controller()
+
+
+def _in_usual_env(controller: Controller, system: System) -> Controller:
+    """Return a controller that is told the middle of the box in place of e."""
+    middle = jnp.mean(jnp.asarray(system.env_box), axis=0)
+
+    def act(
+        params: Params, state: Any, observation: State, env: Environment, window: Array
+    ) -> Any:
+        return controller.act(params, state, observation, middle, window)
+
+    return Controller(controller.init, act)
