@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from sfkd_jax import assembly, policy, store
 from sfkd_jax.assembly import VehicleSettings
@@ -78,7 +78,9 @@ def _load(settings: Settings, name: str) -> policy.Policy:
     directory = policy.SHIPPED / name
     trained = None
     if directory.is_dir():
-        trained = policy.load(directory, controller=store.plain(settings.controller))
+        loaded = policy.load(directory, controller=store.plain(settings.controller))
+        # With settings of a controller, the policy of a system is refused.
+        trained = cast(policy.Policy, loaded)
     saved = None
     if trained is not None:
         # A policy was saved without the settings that came later.

@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
-from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sfkd_jax import policy, store
-from sfkd_jax.certificate import Provenance, Refusal, write
+from sfkd_jax.certificate import Provenance, Refusal, read, write
 from sfkd_jax.certification import CertificationRefused, boxes_of, measure, prove
 from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.fitting import fit_planning
-from sfkd_jax.experiment.tube_settings import TubeSettings
+from sfkd_jax.experiment.tube_settings import LOGGED, TubeSettings, check_settings
 from sfkd_jax.policy import CERTIFICATE, SystemPolicy, TrainedSystem
 from sfkd_jax.ranges import NonNegativeInt
 from sfkd_jax.rollout import fold, on_host
@@ -54,8 +53,6 @@ SMALLEST_PART = 64
 """Smallest number of segments of a part."""
 FIRST_PART = 10
 """Stream of the random keys of the first part."""
-LOGGED = 50
-"""Steps of the training between two lines of its log."""
 SEGMENT = 60
 """Steps of a segment."""
 SPREAD_STEPS = 300
@@ -318,7 +315,7 @@ def certify_system(
         ArtefactError: the directory has a run of another system or other settings.
     """
     parsed = parse(TubeSettings, settings, "tubes.")
-    _check(parsed, system)
+    check_settings(parsed, system.dt)
     tracked = Tracked(system, frame)
     system.check_step(tracked.state(jnp.zeros(len(tracked.names)), tracked.middle))
     tracked.check_invariance(jax.random.key(0))
@@ -326,28 +323,13 @@ def certify_system(
     with store.locked(run.directory):
         trained = run.trained()
         path = run.directory / CERTIFICATE
-        if not path.is_file():
+        if path.is_file():
+            certificate = read(path, SystemCertificate)
+        else:
             certificate = run.certificate(trained)
-            if isinstance(certificate, Refusal):
-                raise CertificationRefused(certificate.reason)
+        if isinstance(certificate, Refusal):
+            raise CertificationRefused(certificate.reason)
     return policy.load_system(run.directory)
-
-
-def _check(settings: TubeSettings, system: System) -> None:
-    """Raise a ValueError for settings with which nothing could be certified."""
-    if settings.steps % LOGGED:
-        raise ValueError(f"steps must be a multiple of {LOGGED}, got {settings.steps}")
-    if settings.duration < system.dt:
-        raise ValueError(
-            f"duration must be a sampling period of {system.dt:g} s at least, "
-            f"got {settings.duration:g}"
-        )
-    needed = ceil(settings.level / (1.0 - settings.level))
-    if settings.runs < needed:
-        raise ValueError(
-            f"runs must be {needed} at least for a level of {settings.level:g}, "
-            f"got {settings.runs}"
-        )
 
 
 def _probes(tracked: Tracked, key: Key) -> Float[Array, "place state"]:

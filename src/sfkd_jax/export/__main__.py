@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 from sfkd_jax import policy, store
 from sfkd_jax.experiment.command import hydra_command
@@ -24,13 +24,15 @@ def main(run: Run) -> dict[str, Any]:
     with store.locked(run_dir):
         run.claim()
         # The weights of the run, the controller of this command.
-        trained = policy.load(
+        loaded = policy.load(
             run_dir,
             controller=store.plain(settings.controller),
             env_source=settings.environment.source,
             # None: that of the certificate.
             latency=None if run.latency.is_none else run.latency,
         )
+        # With settings of a controller, the policy of a system is refused.
+        trained = cast(policy.Policy, loaded)
         # Not refused: a controller without a certificate drives as well.
         if trained.certificate is None:
             store.print_message("exported without a certificate")
