@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control import Stateful, all_finite, safety_filter, size_of
+from sfkd_jax.control import FilterResult, Stateful, all_finite, safety_filter, size_of
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne
@@ -164,25 +164,12 @@ class Shield(Stateful):
             params, state.inner, compared.error, inside, known
         )
         info = reported(info)
-        # A mask by entry: what is compared below is what the system really receives.
         outside = self._outside(compared.error, known[0]) | jnp.any(inside != known_env)
         law_control = self.loop.limited(steady.feedback(compared.error))
         usable = all_finite(planned) & info.plan.healthy & ~outside
         planned = self.loop.limited(planned)
         request = jnp.where(usable, planned - law_control, 0.0)
-        limit = self.loop.law.perturbation
-        ahead = known[jnp.minimum(jnp.arange(self.horizon), known.shape[0] - 1)]
-        passed = safety_filter(
-            self.model,
-            compared.fiber,
-            compared.latent,
-            request,
-            ahead,
-            limit,
-            outputs=[[BODY.start + row for row in rows] for rows in self._rows],
-            widths=[bound.nominal for bound in self.bounds.values()],
-            backups=jnp.concatenate([jnp.diag(limit), -jnp.diag(limit)]),
-        )
+        passed = self._passed(compared, request, known)
         changed = jnp.any(passed.nu != request)
         filtered = self.loop.limited(law_control + passed.nu)
         control = jnp.where(usable & ~changed, planned, filtered)
@@ -212,6 +199,27 @@ class Shield(Stateful):
             ),
         )
         return control, after._replace(inner=inner, env=inside, inputs=known[0]), info
+
+    def _passed(
+        self,
+        compared: _Compared,
+        request: Control,
+        inputs: Float[Array, "horizon inputs"],
+    ) -> FilterResult:
+        """Return what passes of a request."""
+        limit = self.loop.law.perturbation
+        last = inputs.shape[0] - 1
+        return safety_filter(
+            self.model,
+            compared.fiber,
+            compared.latent,
+            request,
+            inputs[jnp.minimum(jnp.arange(self.horizon), last)],
+            limit,
+            outputs=[[BODY.start + row for row in rows] for rows in self._rows],
+            widths=[bound.nominal for bound in self.bounds.values()],
+            backups=jnp.concatenate([jnp.diag(limit), -jnp.diag(limit)]),
+        )
 
     @property
     def _rows(self) -> list[tuple[int, ...]]:

@@ -100,9 +100,21 @@ def measure_tubes(
             claims, tubes, nominals, own.T, strict=True
         )
     }
+    return LoopTubes(
+        conditions=_conditions(loop, duration, dwell),
+        level=level,
+        runs=runs,
+        outputs=outputs,
+        coverage=coverage(bounds, unseen),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _conditions(loop: ClosedLoop, duration: float, dwell: Span) -> LoopConditions:
+    """Return the conditions that runs of a loop meet."""
     system = loop.tracked.system
     frame = loop.tracked.frame
-    conditions = LoopConditions(
+    return LoopConditions(
         input_box=frame.input_box,
         reference_dwell_s=frame.dwell,
         env_box=system.env_box,
@@ -110,14 +122,6 @@ def measure_tubes(
         duration_s=duration,
         sensor_noise=system.sensor_noise,
         perturbation=rows(np.asarray(loop.law.perturbation)),
-    )
-    return LoopTubes(
-        conditions=conditions,
-        level=level,
-        runs=runs,
-        outputs=outputs,
-        coverage=coverage(bounds, unseen),
-        seconds=time.perf_counter() - began,
     )
 
 
