@@ -541,6 +541,30 @@ def foreign_cars():
     return table(["error over that of MPPI with the bicycle", *heads], lines)
 
 
+# ---- systems that are no cars
+
+
+def systems():
+    """Systems of the examples, each in its own unit: a line a system."""
+    lines = []
+    for row in read("experiments/systems.json"):
+        output, tube = next(iter(row["tube"].items()))
+        unit = row["unit"][output]
+        entries = [
+            f"{row['alpha']:.2f}",
+            f"{tube:.2g} {unit}",
+            f"{row['total'][output]:.2g} {unit}",
+            f"{100 * row['coverage']:.0f}",
+            f"{row['rmse'] / row['rmse_oracle']:.2f}",
+            f"{row['rmse_nominal'] / row['rmse']:.1f}",
+        ]
+        name = f"{row['system'].replace('_', ' ')}, {output}"
+        lines.append([name, *(measured(entry, row) for entry in entries)])
+    heads = ["proved rate", "tube", "whole bound", "coverage [%]"]
+    heads += ["RMSE over that of the oracle", "RMSE of nominal over ours"]
+    return table(["system, output", *heads], lines)
+
+
 # ---- latency
 
 
@@ -704,6 +728,7 @@ BLOCKS = {
         "latency_claims": latency_claims,
         "sensors": sensors,
     },
+    "docs/your-system.md": {"systems": systems},
     "docs/results.md": results.TABLES | {"peers": peers, "commonroad": foreign_cars},
 }
 """Page -> name of a block -> what fills it."""

@@ -95,7 +95,7 @@ def main():
                 name,
                 directory,
                 settings=SMALL if given.small else {},
-                comparison=SMALL_COMPARISON if given.small else {},
+                comparison=SMALL_COMPARISON if given.small else {"runs": 8},
             )
             directory.mkdir(parents=True, exist_ok=True)
             file.write_text(json.dumps(rounded(line) | stamp()), "utf-8")
