@@ -1,5 +1,7 @@
 """Systems of the user: their tables are parsed, and what does not fit is refused."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,13 +52,14 @@ def test_bad_tables_are_refused_in_one_line_that_names_the_entry(changed, named)
 
 
 def test_a_step_is_refused_that_does_not_return_a_state():
-    assert refusal_of(mass().check_step) is None
+    still = jnp.zeros(2)
+    assert refusal_of(partial(mass().check_step, still)) is None
     for step, named in (
         (lambda x, u, e: x[:1], "shape (2,): x, v; got (1,)"),
         (lambda x, u, e: x[:, None], "got (2, 1)"),
         (lambda x, u, e: pushed(x, u, e) / jnp.abs(x), "not finite"),
     ):
-        line = refusal_of(mass(step).check_step)
+        line = refusal_of(partial(mass(step).check_step, still))
         assert line is not None
         assert named in line
 

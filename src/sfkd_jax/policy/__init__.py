@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 
@@ -166,6 +166,13 @@ class Policy(TrainedModel):
         return unfold(self.params)
 
 
+if TYPE_CHECKING:
+    # Editors complete the policy of a vehicle, which is what most callers load.
+    Loaded: TypeAlias = Policy
+else:
+    Loaded = Policy | SystemPolicy
+
+
 @policy_numerics()
 def load(
     path: str | Path,
@@ -175,7 +182,7 @@ def load(
     adaptive: bool = False,
     latency: Latency | None = None,
     signed_by: str | Path | None = None,
-) -> Policy:
+) -> Loaded:
     """Return the policy in a run directory, with its certificate verified.
 
     Without a certificate it warns and gives the reason. Of a directory that
@@ -206,7 +213,8 @@ def load(
     if is_system(path):
         if controller or latency or adaptive or signed_by or env_source != "measured":
             raise ValueError(f"{path} is the policy of a system: load it by path alone")
-        return cast(Any, load_system(path))
+        of_system: Any = load_system(path)
+        return of_system
     return _load_vehicle(path, controller, env_source, adaptive, latency, signed_by)
 
 

@@ -159,8 +159,8 @@ def test_an_offset_shifts_a_step_and_nothing_else():
 
 def test_the_certificate_of_the_model_holds_for_the_adapted_one():
     """Its explicit weights are the same arrays; other weights are refused."""
-    model, params = model_and_params("path")
-    certificate = certified("path")
+    model, params = model_and_params()
+    certificate = certified()
     push = jnp.zeros(4), jnp.full(4, 1e3)
     offset = Offset(params, jnp.full(2, 50.0), push)
     adapted = exported(with_offset(model), offset)

@@ -117,7 +117,7 @@ def test_with_a_capacity_a_lane_is_compiled_once_for_all_numbers_of_obstacles():
         traced.append(scene)
         return jnp.sum(scene[1].present), state, scene[1].position
 
-    fixed = policies._with_capacity(Controller(lambda key: key, act), (4, 3))
+    fixed = policies._calling.with_capacity(Controller(lambda key: key, act), (4, 3))
     for count in (0, 1, 4, 2):
         seen = circles(jnp.arange(2.0 * count).reshape(count, 2), 0.8)
         for steps in (1, 3):
@@ -130,7 +130,7 @@ def test_with_a_capacity_a_lane_is_compiled_once_for_all_numbers_of_obstacles():
     with pytest.raises(ValueError, match="5 obstacles do not fit in 4 rows"):
         fixed.act(None, 0.0, 0.0, 0.0, (None, circles(jnp.ones((5, 2)), 0.8)))
     with pytest.raises(ValueError, match="capacity must be"):
-        policies._with_capacity(fixed, (4, 0))
+        policies._calling.with_capacity(fixed, (4, 0))
 
 
 def test_two_boxes_are_never_nearer_than_is_said():
