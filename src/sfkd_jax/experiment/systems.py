@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -118,7 +118,9 @@ class SystemRun:
             dwell=settings.dwell,
             perturbation=settings.perturbation,
         )
-        store.print_message(f"the law contracts at {rate:g} a step in one metric")
+        store.print_message(
+            f"the law contracts at {rate:g} a step at the corners of its table"
+        )
         return ClosedLoop(self.tracked, law)
 
     @cached_property
@@ -275,15 +277,15 @@ class SystemRun:
             dwell=self.settings.dwell,
             level=self.settings.level,
         )
-        provenance = Provenance(
-            **{
-                **vars(provenance),
-                "seconds": time.perf_counter() - began,
-                "seconds_proof": proved,
-            }
-        )
         return SystemCertificate(
-            proof=proof, measured=measured, tubes=tubes, provenance=provenance
+            proof=proof,
+            measured=measured,
+            tubes=tubes,
+            provenance=replace(
+                provenance,
+                seconds=time.perf_counter() - began,
+                seconds_proof=proved,
+            ),
         )
 
 
