@@ -19,11 +19,13 @@ from sfkd_jax.systems._runs import random_runs as random_runs
 from sfkd_jax.systems._runs import spread_of as spread_of
 from sfkd_jax.systems._shield import OutputBound as OutputBound
 from sfkd_jax.systems._shield import Shield as Shield
+from sfkd_jax.systems._simulated import simulated as simulated
 from sfkd_jax.systems._steady_states import NoLaw as NoLaw
 from sfkd_jax.systems._steady_states import SteadyStates as SteadyStates
 from sfkd_jax.systems._steady_states import steady_states as steady_states
 from sfkd_jax.systems._system import System as System
 from sfkd_jax.systems._system import integrated as integrated
+from sfkd_jax.systems._system import split_label as split_label
 from sfkd_jax.systems._task import TrackingTask as TrackingTask
 from sfkd_jax.systems._task import tracking_task as tracking_task
 from sfkd_jax.systems._tracking import Tracked as Tracked
