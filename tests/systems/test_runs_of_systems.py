@@ -63,7 +63,7 @@ def test_references_stay_in_their_ranges_and_change_with_the_dwell(name, key):
     draw = jax.jit(jax.vmap(partial(random_reference, of, steps=STEPS)))
     points, rates = draw(jax.random.split(key, 40))
     for state, (low, high) in of.frame.ranges.items():
-        values = np.asarray(points)[..., of.frame.chained.index(state)]
+        values = np.asarray(points)[..., of.frame.followed.index(state)]
         room = ROOM * (high - low)
         assert values.min() >= low - room
         assert values.max() <= high + room

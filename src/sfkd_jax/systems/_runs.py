@@ -90,13 +90,13 @@ def random_reference(tracked: Tracked, key: Key, *, steps: int) -> Reference:
         after = tracked.advance(point, rates)
         return after, (after, rates)
 
-    start = jnp.zeros(len(tracked.chained))
+    start = jnp.zeros(len(tracked.followed))
     # A chain that moves between places begins at rest, or it could leave its range.
     at_rest = {chain[1:] for chain in frame.reference if chain[0] in frame.ranges}
     for state, ends in frame.ranges.items():
         if (state,) in at_rest:
             continue
-        index = frame.chained.index(state)
+        index = frame.followed.index(state)
         draw = within(ends, jax.random.fold_in(start_key, index))
         start = start.at[index].set(draw)
     _, (after, rates) = jax.lax.scan(step, start, goals)
