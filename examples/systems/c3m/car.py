@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.systems import System, integrated, tracking
 
-DT = 0.03  # sampling period of the source [s]
+DT = 0.05  # sampling period [s]; 0.03 in the source
 STARTS = dict.fromkeys(("x", "y", "heading", "speed"), (-1.0, 1.0))
 """Errors at the start of the source's runs, whose length is `DURATION` [s]."""
 DURATION = 6.0

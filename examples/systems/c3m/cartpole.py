@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.systems import System, integrated, tracking
 
-DT = 0.03  # sampling period of the source [s]
+DT = 0.05  # sampling period [s]; 0.03 in the source
 CART = 1.0  # M [kg]
 LENGTH = 1.0  # l [m]
 GRAVITY = 9.8  # [m/s²]

@@ -15,7 +15,7 @@ import jax
 
 from sfkd_jax.systems import System, integrated, tracking
 
-DT = 0.03  # sampling period of the source [s]
+DT = 0.05  # sampling period [s]; 0.03 in the source
 MASS = 1.47  # [kg]
 GRAVITY = 9.81  # [m/s²]
 STARTS = dict.fromkeys(("x", "y", "vx", "vy", "vz"), (-1.0, 1.0))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.systems import System, integrated, tracking
 
-DT = 0.03  # sampling period of the source [s]
+DT = 0.05  # sampling period [s]; 0.03 in the source
 GRAVITY = 9.81  # [m/s²]
 STATES = "x", "y", "z", "vx", "vy", "vz", "pitch", "roll"
 STARTS = dict.fromkeys(STATES, (-0.5, 0.5))

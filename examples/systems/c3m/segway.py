@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.systems import System, integrated, tracking
 
-DT = 0.03  # sampling period of the source [s]
+DT = 0.05  # sampling period [s]; 0.03 in the source
 STARTS = {"p": (-1.0, 1.0), "v": (-0.5, 0.5)}
 STARTS |= {"angle": (-1.047, 1.047), "turn": (-3.142, 3.142)}
 """Errors at the start of the source's runs, whose length is `DURATION` [s]."""

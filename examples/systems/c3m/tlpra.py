@@ -4,7 +4,7 @@
 
 The masses are at the ends of the links, and the angles count from the horizontal and
 from the first link. The source stands upright at the angles (π/2, 0); here the angles
-move around these. e is the load, 0 there, and the sampling period 0.01 s there.
+move around these. e is the load, 0 there.
 
 Source: Sun, Jha and Fan, Learning Certified Control Using Contraction Metric (C3M),
 CoRL 2020, and its code, github.com/sundw2014/C3M.
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from sfkd_jax.systems import System, integrated, regulation
 
-DT = 0.02  # sampling period [s]
+DT = 0.04  # sampling period [s]; 0.01 in the source
 LENGTH = 1.0  # of each link [m]
 UPPER, LOWER = 0.8, 2.3  # masses [kg]
 GRAVITY = 9.8  # [m/s²]
