@@ -5,6 +5,7 @@
 Every system of examples/systems is certified in ROOT/NAME, which is continued where it
 stopped, and then driven beside its law, an oracle and a nominal model. A system of a
 publication that says from where it starts, as c3m/pvtol does, starts from there too.
+An example may have `SETTINGS` of its own for `certify_system`.
 Its line of JSON is printed and kept in ROOT/NAME/line.json, that of --small in
 small.json. With --write the lines in ROOT become experiments/systems.json.
 """
@@ -29,12 +30,8 @@ from sfkd_jax.experiment.systems import certify_system
 from sfkd_jax.systems import NoLaw
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "systems"
-SYSTEMS = tuple(
-    sorted(
-        file.relative_to(EXAMPLES).with_suffix("").as_posix()
-        for file in EXAMPLES.rglob("*.py")
-    )
-)
+FILES = [*sorted(EXAMPLES.glob("*.py")), *sorted(EXAMPLES.glob("*/*.py"))]
+SYSTEMS = tuple(file.relative_to(EXAMPLES).with_suffix("").as_posix() for file in FILES)
 RESULTS = Path(__file__).with_suffix(".json")
 STARTS = 200
 """Number of starts of a publication."""
@@ -101,8 +98,9 @@ def line_of(name, directory, *, settings, comparison):
     example = runpy.run_path(str(EXAMPLES / f"{name}.py"))
     system, frame = example["make"]()
     line = {"system": name, "states": len(system.states)}
+    own = example.get("SETTINGS", {})
     try:
-        policy = certify_system(system, frame, root=directory, **settings)
+        policy = certify_system(system, frame, root=directory, **own, **settings)
     except (NoLaw, CertificationRefused) as reason:
         return line | {"refused": str(reason)}
     minutes = (time.perf_counter() - began) / 60.0
