@@ -57,7 +57,7 @@ def rounded(value):
     return value
 
 
-def share_back(policy, system, starts, *, duration):
+def share_back(policy, system, starts, *, duration, runs=STARTS):
     """Share of the starts of a publication from which a policy reaches its reference.
 
     A run is back if all outputs are within their whole bounds in its last `BACK` s.
@@ -67,12 +67,13 @@ def share_back(policy, system, starts, *, duration):
         system: with its step.
         starts: state -> ends of the errors at the start.
         duration: of a run [s].
+        runs: number of starts.
     """
     scene_key, start_key, drive_key = jax.random.split(jax.random.key(2), 3)
-    scenes = random_scenes(policy, scene_key, runs=STARTS, duration=duration)
+    scenes = random_scenes(policy, scene_key, runs=runs, duration=duration)
     low, high = np.asarray([starts.get(name, (0, 0)) for name in system.state_names]).T
     away = jax.random.uniform(start_key, scenes.start.shape, minval=low, maxval=high)
-    runs = run_controller(
+    driven = run_controller(
         policy,
         system.step,
         policy.controller,
@@ -81,7 +82,7 @@ def share_back(policy, system, starts, *, duration):
         drive_key,
     )
     totals = [bound.total for bound in policy.certificate.tubes.outputs.values()]
-    last = np.asarray(runs.errors[:, -round(BACK / system.dt) :])
+    last = np.asarray(driven.errors[:, -round(BACK / system.dt) :])
     return float(np.mean(np.all(last <= totals, axis=(1, 2))))
 
 
