@@ -13,8 +13,8 @@ from sfkd_jax.systems import (
     NoLaw,
     Tracked,
     _derivation,
+    best_law,
     derive_law,
-    fastest_law,
     regulation,
     steady_states,
 )
@@ -145,15 +145,15 @@ def test_a_law_contracts_between_the_corners_too(key):
         derive_law(of, steady_states(of, points=5), rate=0.7)
 
 
-def test_the_fastest_law_does_not_saturate(key, monkeypatch):
-    law, rate = fastest_law(tracked(), steady(), key, dwell=DWELL)
+def test_the_best_law_does_not_saturate(key, monkeypatch):
+    law, rate = best_law(tracked(), steady(), key, dwell=DWELL)
     assert rate <= 0.86
     matrices = closed_loops(tracked(), law, places_inside(law, 20, key))
     assert np.abs(np.linalg.eigvals(matrices)).max() <= rate + 1e-3
     monkeypatch.setattr(_derivation, "SATURATED", -1.0)
     monkeypatch.setattr(_derivation, "RATES", (0.8, 0.9))
     with pytest.raises(NoLaw, match=r"saturation: at a rate of 0.9 a control is at"):
-        fastest_law(tracked(), steady(), key, dwell=DWELL)
+        best_law(tracked(), steady(), key, dwell=DWELL)
 
 
 def test_a_reference_that_asks_for_too_much_is_refused_where_it_does():
