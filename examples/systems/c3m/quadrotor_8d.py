@@ -21,7 +21,7 @@ STARTS = dict.fromkeys(STATES, (-0.5, 0.5))
 """Errors at the start of the source's runs, whose length is `DURATION` [s]."""
 DURATION = 6.0
 SETTINGS = {"rate": 0.86}
-"""Of `certify_system`: the law of the fastest rate brings few of these starts back."""
+"""Of `certify_system`: the law that it takes itself brings few of these starts back."""
 
 
 def rates(state, control, env):
