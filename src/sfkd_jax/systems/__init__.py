@@ -6,8 +6,8 @@ from sfkd_jax.systems._certificate import OutputBounds as OutputBounds
 from sfkd_jax.systems._certificate import SystemCertificate as SystemCertificate
 from sfkd_jax.systems._closed_loop import ClosedLoop as ClosedLoop
 from sfkd_jax.systems._controller import Following as Following
+from sfkd_jax.systems._derivation import best_law as best_law
 from sfkd_jax.systems._derivation import derive_law as derive_law
-from sfkd_jax.systems._derivation import fastest_law as fastest_law
 from sfkd_jax.systems._frame import Tracking as Tracking
 from sfkd_jax.systems._frame import regulation as regulation
 from sfkd_jax.systems._frame import tracking as tracking
