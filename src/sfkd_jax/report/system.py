@@ -23,6 +23,7 @@ from sfkd_jax.report.sections import (
     read_optional,
 )
 from sfkd_jax.report.tables import record_table
+from sfkd_jax.settings import Values
 from sfkd_jax.systems import split_label
 
 COMPARISON = "comparison.json"
@@ -61,7 +62,7 @@ def write_system_report(run_dir: Path) -> dict[str, Any]:
         return write_page(f"{name}, seed {plain(settings.get('seed'))}", sections, home)
 
 
-def _bounds(certificate: dict[str, Any], settings: dict[str, Any]) -> list[Part]:
+def _bounds(certificate: dict[str, Any], settings: Values) -> list[Part]:
     """Return a table of the bounds of the outputs, and what they hold for."""
     if not holds(certificate):
         reason = plain(certificate.get("reason") or f"{CERTIFICATE} is missing")
@@ -95,7 +96,7 @@ def _bounds(certificate: dict[str, Any], settings: dict[str, Any]) -> list[Part]
 def _runs(
     run_dir: Path,
     certificate: dict[str, Any],
-    settings: dict[str, Any],
+    settings: Values,
     images: Path,
 ) -> list[Part]:
     """Return the RMSE of policy and rivals, and their errors in the first run."""
@@ -152,7 +153,7 @@ def errors_over_time(
     return figure
 
 
-def _certified(certificate: dict[str, Any], settings: dict[str, Any]) -> list[Part]:
+def _certified(certificate: dict[str, Any], settings: Values) -> list[Part]:
     """Return what is proved, and the class that the bounds are about."""
     if not holds(certificate):
         return []
@@ -175,7 +176,7 @@ def _certified(certificate: dict[str, Any], settings: dict[str, Any]) -> list[Pa
     ]
 
 
-def _units(settings: dict[str, Any]) -> dict[str, str]:
+def _units(settings: Values) -> dict[str, str]:
     """Return the unit of each output."""
     labels = dict(map(split_label, settings["system"]["states"]))
     return {
