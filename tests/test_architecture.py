@@ -35,7 +35,8 @@ GROUND = {
     "certificate": {"ranges", "store"},
     "models": CORE,
     "control": CORE,
-    "training": CORE | {"store"},
+    "progress": {"store"},
+    "training": CORE | {"progress", "store"},
     "data": CORE,
     "evaluation": CORE,
     "certification": CORE | {"certificate", "data"},
@@ -127,7 +128,8 @@ THIRD_PARTY = {
     "assembly": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},
-    "experiment": COMMAND_LINE | {"threadpoolctl", "yaml"},
+    "progress": {"tqdm"},
+    "experiment": COMMAND_LINE | {"threadpoolctl", "yaml", "tensorboardX", "wandb"},
 } | {command: COMMAND_LINE for command in COMMANDS}
 HEAVY = {
     *("hydra", "omegaconf", "cvxpy", "clarabel", "orbax", "brax", "matplotlib"),

@@ -238,7 +238,7 @@ def named_for_sweep(settings: Settings) -> Settings:
     for override in dict.fromkeys(word.lstrip("+") for word in _typed()):
         setting = override.split("=")[0]
         group = setting.split(".")[0]
-        if group in IDENTITY and setting not in ("model", "seed"):
+        if group in IDENTITY and setting not in ("model", "seed", "training.logger"):
             overrides.append(override)
     if not overrides:
         return settings

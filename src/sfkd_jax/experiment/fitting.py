@@ -14,6 +14,7 @@ from sfkd_jax.data import Dataset, measure_space, random_windows, spread_windows
 from sfkd_jax.driving.drives import SCENARIOS
 from sfkd_jax.evaluation import open_loop
 from sfkd_jax.experiment import identified
+from sfkd_jax.experiment.loggers import logger
 from sfkd_jax.experiment.options import TrainingSettings
 from sfkd_jax.experiment.source import DataSource
 from sfkd_jax.models import physics
@@ -110,16 +111,18 @@ def _fit_model(
     if model.fitting.identify is not None:
         params = model.fitting.identify(dataset.train, dataset.validation, key)
         return params, None
-    return fit(
-        model,
-        loss,
-        partial(random_windows, batch=training.batch, length=training.window),
-        dataset.train,
-        _validation_windows(training, dataset),
-        key,
-        directory,
-        **arguments(training, fit),
-    )
+    with logger(training.logger, directory, store.plain(training)) as callback:
+        return fit(
+            model,
+            loss,
+            partial(random_windows, batch=training.batch, length=training.window),
+            dataset.train,
+            _validation_windows(training, dataset),
+            key,
+            directory,
+            callback=callback,
+            **arguments(training, fit),
+        )
 
 
 def fit_planning(

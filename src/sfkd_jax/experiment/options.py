@@ -148,7 +148,7 @@ class LogSettings(DatasetSettings):
 
 @takes(
     training.fit,
-    skip=("inspect",),
+    skip=("callback",),
     loss=schema("Loss", object, training.multi_step_loss),
 )
 class TrainingSettings:
@@ -159,12 +159,14 @@ class TrainingSettings:
         batch: number of windows in an optimisation step.
         window: number of time steps of a window.
         steps: number of optimisation steps.
+        logger: library that the metrics go to, see `experiment.loggers`; None for none.
     """
 
     loss: Any
     batch: int = 128
     window: int = 20
     steps: int = 4000
+    logger: str | None = None
 
 
 @takes(

@@ -94,10 +94,13 @@ class Run:
     @cached_property
     def identity(self) -> dict[str, Any]:
         """The settings that determine the weights of the run, as plain values."""
+        training = store.plain(self.settings.training)
+        # Who is told of a training does not change it.
+        del training["logger"]
         return {
             **self.source.config,
             "model": store.plain(self.settings.model),
-            "training": store.plain(self.settings.training),
+            "training": training,
             "seed": self.settings.seed,
         }
 

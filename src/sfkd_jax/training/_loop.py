@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import optax
 
 from sfkd_jax import store
+from sfkd_jax.progress import Progress
 from sfkd_jax.ranges import Positive
 from sfkd_jax.training._checkpoints import Checkpoints
 from sfkd_jax.training._losses import Loss
@@ -23,6 +24,8 @@ from sfkd_jax.types import Key, Model, Params, Trajectory
 
 Draw: TypeAlias = Callable[[Trajectory, Key], Trajectory]
 """(training trajectories, key) -> a batch of windows."""
+Callback: TypeAlias = Callable[[int, Mapping[str, float]], None]
+"""(step, metrics) -> nothing: what is told of a training, such as a logger."""
 WARM_UP = 100
 """Steps until the largest learning rate, in all but short runs."""
 LOG = "metrics.jsonl"
@@ -47,6 +50,10 @@ class TrainState(NamedTuple):
     optimizer: Any
 
 
+def no_callback(step: int, metrics: Mapping[str, float]) -> None:
+    """Tell nobody."""
+
+
 def fit(
     model: Model,
     loss: Loss,
@@ -61,6 +68,7 @@ def fit(
     clip_norm: Positive = 100.0,
     log_every: int = 50,
     save_every: int = 500,
+    callback: Callback = no_callback,
 ) -> tuple[Params, int]:
     """Train and return the parameters with the lowest validation loss.
 
@@ -85,6 +93,7 @@ def fit(
         log_every: number of steps in a compiled chunk and between lines of the log; it
             divides `steps`.
         save_every: number of steps between checkpoints, a multiple of `log_every`.
+        callback: (step, metrics), called after every line of the log.
 
     Returns:
         The best parameters, and the step at which they were reached.
@@ -92,48 +101,48 @@ def fit(
     Raises:
         TrainingStopped: the loss or a gradient is not finite.
     """
-    directory = Path(directory)
     _check_multiples(steps, save_every, log_every)
     # Batches have a key of their own, so that a resumed run draws the same ones.
     init_key, data_key = jax.random.split(key)
     transform, schedule = _optimizer(steps, learning_rate, clip_norm)
     # Compiled, since initialisers op by op take seconds for many small matrices.
     begin = jax.jit(partial(_begin, model, transform))
-    training = {
-        **_fingerprint(model, draw, data, key),
-        "steps": steps,
-        "learning_rate": learning_rate,
-        "clip_norm": clip_norm,
-        "save_every": save_every,
-    }
+    training = _fingerprint(model, draw, data, key)
+    training |= {"steps": steps, "learning_rate": learning_rate}
+    training |= {"clip_norm": clip_norm, "save_every": save_every}
 
-    # This number stands for what no hash tells: loss, model and held-out data.
+    # It stands for what no hash tells: loss, model and held-out data.
     def first_loss() -> float:
         return float(loss.validate(begin(init_key).params, held_out)[0])
 
+    directory = Path(directory)
     log = directory / LOG
     # Closed after an error as well: the caller may open the directory again to resume.
-    with closing(Checkpoints(directory / "checkpoints")) as checkpoints:
+    with ExitStack() as until_the_end:
+        kept = closing(Checkpoints(directory / "checkpoints"))
+        checkpoints = until_the_end.enter_context(kept)
         _claim(directory, training, first_loss, checkpoints.latest_step())
         state = checkpoints.resume(begin(init_key))
         start = int(state.step)
         _drop_lines_after(log, start)
         began = time.perf_counter()
         advance = _chunk(loss, transform, schedule, draw, length=log_every)
+        progress = until_the_end.enter_context(Progress("training", steps, start))
         for done in range(start + log_every, steps + 1, log_every):
             state, means = advance(state, data, data_key)
             record = {name: float(value) for name, value in means.items()}
-            record["step"] = done
-            record["seconds"] = time.perf_counter() - began
+            record |= {"step": done, "seconds": time.perf_counter() - began}
             saves = done % save_every == 0 or done == steps
-            # The validation loss is for the choice between saved states.
-            if saves:
+            if saves:  # the validation loss is for the choice between saved states
                 record.update(_validation(model, loss, state.params, held_out))
             _require_finite(record, checkpoints)
             # Before the checkpoint: a resumed run can drop lines, but not add them.
-            _append(log, record, steps)
+            _append(log, record)
+            callback(done, record)
+            progress.advance(log_every)
             if saves:
                 checkpoints.save(done, state, record["validation_loss"])
+                progress.note(_losses(record))
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
 
@@ -269,17 +278,17 @@ def _require_finite(record: dict[str, float], checkpoints: Checkpoints) -> None:
         )
 
 
-def _append(path: Path, record: dict[str, float], steps: int) -> None:
-    """Append one record to the log, and print its losses when they are validated."""
+def _losses(record: dict[str, float]) -> str:
+    """Return the losses of a record of the log, for a person."""
+    return f"loss {record['loss']:.3g}, validation_loss {record['validation_loss']:.3g}"
+
+
+def _append(path: Path, record: dict[str, float]) -> None:
+    """Append one record to the log."""
     # The file is opened for each line, so that whole lines are on disk whatever ends
     # the process.
     with path.open("a") as file:
         file.write(json.dumps(record) + "\n")
-    if "validation_loss" in record:
-        store.print_message(
-            f"training {record['step']} / {steps}  loss {record['loss']:.3g} "
-            f"validation_loss {record['validation_loss']:.3g}"
-        )
 
 
 def _optimizer(

@@ -1,0 +1,81 @@
+"""How far long work is: a bar on a terminal, lines with times where there is none."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+from sfkd_jax.store import print_message
+
+
+class Progress:
+    """Work in steps that are counted, with the time that is left.
+
+    On a terminal it is a bar of tqdm, if that is installed. Elsewhere every `note` is a
+    line, such as in the log of a batch job.
+
+        with Progress("training", 6000) as progress:
+            progress.advance(50)
+            progress.note("loss 1.2")
+    """
+
+    def __init__(self, name: str, total: int, done: int = 0) -> None:
+        """Begin.
+
+        Args:
+            name: of the work.
+            total: number of steps.
+            done: steps that were done before.
+        """
+        self._name = name
+        self._total = total
+        self._first = done
+        self._done = done
+        self._began = time.monotonic()
+        self._bar = _bar(name, total, done)
+
+    def __enter__(self) -> Progress:
+        """Return it, to be closed at the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the bar as it is."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def advance(self, count: int = 1) -> None:
+        """Count steps that were done."""
+        self._done += count
+        if self._bar is not None:
+            self._bar.update(count)
+
+    def note(self, text: str) -> None:
+        """Say something about the work so far."""
+        if self._bar is not None:
+            self._bar.set_postfix_str(text)
+            return
+        clock = time.strftime("%H:%M:%S")
+        counted = f"{clock} {self._name} {self._done} / {self._total}"
+        print_message(f"{counted}, {self._left()} left: {text}")
+
+    def _left(self) -> str:
+        """Return the time that is left at the rate so far, such as "1:20"."""
+        done = self._done - self._first
+        if not done:
+            return "?"
+        seconds = (time.monotonic() - self._began) / done * (self._total - self._done)
+        minutes, rest = divmod(round(seconds), 60)
+        hours, minutes = divmod(minutes, 60)
+        return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _bar(name: str, total: int, done: int) -> Any:
+    """Return a bar on the terminal; None without a terminal or without tqdm."""
+    if not sys.stderr.isatty():
+        return None
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return None
+    return tqdm(desc=name, total=total, initial=done, file=sys.stderr)
