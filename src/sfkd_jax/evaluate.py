@@ -16,8 +16,8 @@ def main(run: Run) -> dict[str, Any]:
     if not systems:
         raise ValueError("evaluation.systems is empty: there is nothing to evaluate")
     stages.check_settings(run)
-    path = evaluate_run(run, command=command_line("evaluate"))
-    return {"results": str(path), "rows": len(systems)}
+    path, rows = evaluate_run(run, command=command_line("evaluate"))
+    return {"results": str(path), "rows": len(rows)}
 
 
 if __name__ == "__main__":

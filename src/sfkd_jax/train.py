@@ -6,13 +6,17 @@ import time
 from typing import Any
 
 from sfkd_jax import store
+from sfkd_jax.certificate import Refusal
 from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.named_system import train_system
 from sfkd_jax.experiment.run import Run
+from sfkd_jax.report import style
 from sfkd_jax.report.run import write_report
+from sfkd_jax.report.tables import name_of
 
 
 def main(run: Run) -> dict[str, Any]:
@@ -57,8 +61,10 @@ def _run_stages(run: Run) -> dict[str, Any]:
         return summary
     certificate = stages.certify_policy(run)
     results = None
+    rows: list[Row] = []
     if run.plant.simulated:
-        results = str(evaluate_run(run, command=command_line("train")))
+        path, rows = evaluate_run(run, command=command_line("train"))
+        results = str(path)
     else:
         store.print_message(
             "not driven: vehicle=own is known from logs alone; "
@@ -66,6 +72,7 @@ def _run_stages(run: Run) -> dict[str, Any]:
         )
     with store.as_artefact_error(run_dir):
         pages = write_report(run_dir)
+    _print_findings(certificate, rows)
     store.print_message(f"report: {pages['report']}")
     summary["certificate"] = str(run.certificate_path)
     summary["results"] = results
@@ -73,6 +80,21 @@ def _run_stages(run: Run) -> dict[str, Any]:
     is_certified = isinstance(certificate, DrivingCertificate)
     summary["alpha"] = certificate.proof.alpha if is_certified else None
     return summary
+
+
+def _print_findings(certificate: DrivingCertificate | Refusal, rows: list[Row]) -> None:
+    """Print what a person wants to know of a run: its corridor, and who drove how."""
+    corridor = getattr(certificate, "corridor", None)
+    if corridor is not None:
+        coverage = corridor.coverage
+        store.print_message(
+            f"corridor: {corridor.corridor_m:.3f} m to each side, kept in "
+            f"{100 * coverage.share:.1f} % of {coverage.runs} fresh runs"
+        )
+    if rows:
+        errors = [f"{name_of(row)} {1e3 * row['rmse_m']['mean']:.1f}" for row in rows]
+        scenario = style.scenario_label(str(rows[0]["scenario"]))
+        store.print_message(f"RMSE on {scenario} [mm]: {', '.join(errors)}")
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ read_policy = partial(store.read_arrays, kind="policy")
 def smoke(tmp_path_factory):
     """One smoke run from nothing; tests that change it copy it first."""
     directory = tmp_path_factory.mktemp("run")
-    return directory, last_line(
-        run_command("train", "+experiment=smoke", cwd=directory)
-    )
+    done = run_command("train", "+experiment=smoke", cwd=directory)
+    (directory / "messages.txt").write_text(done.stderr, "utf-8")
+    return directory, last_line(done)
 
 
 @pytest.fixture
@@ -44,6 +44,17 @@ def test_train_goes_from_nothing_to_a_report(smoke):
     assert 0 < document["objective"] < np.inf
     assert len(document["open_loop_rmse_m"]) == 20
     assert 0.9 < document["alpha"] < 0.996
+
+
+def test_its_last_messages_are_who_drove_how_and_the_page(smoke):
+    directory, document = smoke
+    *_, errors, page = (directory / "messages.txt").read_text("utf-8").splitlines()
+    rows = store.read_json(directory / document["results"])["rows"]
+    shown = [f" {1e3 * row['rmse_m']['mean']:.1f}" for row in rows]
+    assert errors.startswith("RMSE on ")
+    assert all(number in errors for number in shown)
+    assert errors.count(",") == len(rows) - 1
+    assert page == f"report: {document['report']}"
 
 
 def test_the_certificate_is_about_the_weights(smoke):

@@ -316,7 +316,7 @@ def _columns(run: Run, name: str, system: System) -> Row:
     }
 
 
-def evaluate_run(run: Run, *, command: str | None = None) -> Path:
+def evaluate_run(run: Run, *, command: str | None = None) -> tuple[Path, list[Row]]:
     """Evaluate every system of `evaluation.systems` and add its rows to the results.
 
     Rows of other scenarios and controllers in the same run stay.
@@ -326,7 +326,7 @@ def evaluate_run(run: Run, *, command: str | None = None) -> Path:
         command: the command as it was typed, which is stored with the results.
 
     Returns:
-        The path of results.json.
+        The path of results.json, and the rows of these systems.
     """
     began = time.perf_counter()
     # Vehicle and earlier results are checked before anything is trained.
@@ -341,7 +341,8 @@ def evaluate_run(run: Run, *, command: str | None = None) -> Path:
         seconds = time.perf_counter() - began
         return run_directory.write_results(run.directory, config, results, seconds)
 
-    return keep(drive(run, systems, episodes, keep))
+    results = drive(run, systems, episodes, keep)
+    return keep(results), [result.row for result in results]
 
 
 def _keep_nothing(results: list[SystemResult]) -> None:
