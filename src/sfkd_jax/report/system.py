@@ -76,12 +76,12 @@ def _bounds(certificate: dict[str, Any], settings: Values) -> list[Part]:
         for name, bound in tubes["outputs"].items()
     }
     share = percent(dig(tubes, "coverage", "share"))
-    interval_95 = interval(dig(tubes, "coverage", "ci95"))
+    interval_95 = interval(dig(tubes, "coverage", "ci95"), scale=100.0)
     return [
-        f"With probability {percent(tubes['level'])} all outputs stay within these "
+        f"With probability {percent(tubes['level'])} % all outputs stay within these "
         f"bounds on a new run of {short(dig(tubes, 'conditions', 'duration_s'))} s. "
-        f"{tubes['runs']} runs calibrated them; they held in {share} of as many fresh "
-        f"ones, 95 % interval {interval_95}.",
+        f"{tubes['runs']} runs calibrated them; they held in {share} % of as many "
+        f"fresh ones, 95 % interval {interval_95}.",
         record_table(
             "Output",
             rows,
@@ -118,7 +118,7 @@ def _runs(
     style.save(path, errors_over_time, first, bounds, _units(settings), dt)
     claimed = percent(compared.get("claimed"))
     return [
-        f"The policy claimed a bound in {claimed} of the steps, and was beyond it in "
+        f"The policy claimed a bound in {claimed} % of the steps, and was beyond it in "
         f"{plain(compared.get('beyond'))}.",
         record_table("Controller", rows, f"RMSE of {output} [{unit}]"),
         Picture(path, "Errors in the first run"),
