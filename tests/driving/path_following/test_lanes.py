@@ -1,5 +1,6 @@
 """The reference as a plan: lateral moves, obstacles, and what may be committed."""
 
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -24,11 +25,13 @@ from sfkd_jax.driving.path_following.lanes._reference import (
 )
 from sfkd_jax.driving.paths import (
     Lap,
+    Path,
     path_from_curvature,
     path_through,
     point_at,
     quintic,
 )
+from sfkd_jax.driving.sizes import Scale
 from sfkd_jax.info import Claim, ControllerInfo, Reason
 from sfkd_jax.types import Controller
 
@@ -274,13 +277,20 @@ def follower():
     return Controller(lambda key: jnp.zeros(()), act)
 
 
-def lane_with(planner, **settings):
+def lane_with(planner, kind=KIND, **settings):
     """The controller of a lane, and its step as one program."""
-    task = path_following.Manoeuvres(kind=KIND, dt=DT)
-    search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
+    task = path_following.Manoeuvres.scaled(kind, DT)
+    length, speed = kind.scale
+    noise = (1.5 * length, 10.0 * length, 1.5 * length, 10.0 * length, speed)
+    search = {"horizon": 1, "noise_std": noise, "noise": "white"}
     search = planner(task.task(), **search, **settings)
     driver = path_following.in_lane(
-        inner=follower(), planner=search, manoeuvres=task, horizon=20
+        inner=follower(),
+        planner=search,
+        manoeuvres=task,
+        horizon=20,
+        view=100.0 * length,
+        spacing=0.5 * length,
     )
     return driver, jit(driver.act)
 
@@ -364,6 +374,48 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, pl
             before.committed.move[:, moved : moved + SPLICE + 1],
             atol=1e-5,
         )
+
+
+def test_a_small_vehicle_drives_the_same_manoeuvre_in_its_own_units(lane, road):
+    """An eighth of the lengths and of the speeds, up to posts and to a stop."""
+    small = 0.125
+    kind = replace(
+        KIND,
+        curvature=KIND.curvature / small,
+        turning=KIND.turning / small**2,
+        lateral=KIND.lateral * small,
+        jerk=KIND.jerk * small,
+        speed=(8.0 * small, 10.5 * small),
+        half=(2.25 * small, 0.9 * small),
+        corridor=0.14 * small,
+        acceleration=small,
+        deceleration=small,
+        braking=6.0 * small,
+        scale=Scale(small, small),
+    )
+    points = road.path.points * jnp.asarray([small, small, 1.0, 1.0 / small])
+    lanes = {
+        1.0: (lane, road),
+        small: (
+            lane_with(control.mppi, kind, num_samples=100, effective_samples=5.0),
+            lane_along(Path(points, 0.5 * small), width=12.0 * small, speed=10 * small),
+        ),
+    }
+    wall = np.array([[100.0, d] for d in np.arange(-6.0, 6.1, 1.5)])
+    places = beside(road, np.concatenate([POSTS[:2], wall[:7]]))
+    driven = []
+    for scale, (driver, street) in lanes.items():
+        posts = circles(places * scale, 0.8 * scale)
+
+        def seen(number, car, posts=posts):
+            return posts
+
+        # Their grip is so large that only the class limits what they do.
+        rows = drive(driver, street, seen, 110, speed=10.0 * scale, friction=0.9)
+        units = np.array([scale, scale, 1.0, scale])
+        driven.append(np.stack([car for car, _, _ in rows]) / units)
+    np.testing.assert_allclose(driven[1], driven[0], atol=0.02)
+    assert driven[0][-1, 3] < 9.0
 
 
 @pytest.mark.parametrize("wall", ["one", "many"])

@@ -49,7 +49,7 @@ from sfkd_jax.types import (
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
 LOST = 10.0
-"""Distance from the expected place beyond which the car is somewhere else [m]."""
+"""Distance from the expected place beyond which it is somewhere else; of a car [m]."""
 
 
 class LaneState(NamedTuple):
@@ -289,7 +289,8 @@ class InLane(Stateful):
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
         # A road may cross itself. The nearest point of all counts only if the car is
         # not near the expected one.
-        fresh = known & ~(state.started & (away < LOST))
+        near = away < LOST * limits.scale.length
+        fresh = known & ~(state.started & near)
         nearest = jnp.argmin(jnp.sum((path.points[:, :2] - position) ** 2, axis=1))
         start = jnp.where(fresh, nearest * path.spacing, guess)
         progress, lateral = project(path, position, start)
