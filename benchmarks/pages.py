@@ -546,8 +546,15 @@ def foreign_cars():
 
 def systems():
     """Systems of the examples, each in its own unit: a line a system."""
+    heads = ["proved rate", "tube", "whole bound", "coverage [%]"]
+    heads += ["RMSE over that of the oracle", "RMSE of nominal over ours"]
+    heads.append("starts that come back [%]")
     lines = []
     for row in read("experiments/systems.json"):
+        name = row["system"].replace("c3m/", "C3M: ").replace("_", " ")
+        if "refused" in row:
+            lines.append([name, measured("refused", row), *[""] * (len(heads) - 1)])
+            continue
         output, tube = next(iter(row["tube"].items()))
         unit = row["unit"][output]
         entries = [
@@ -558,10 +565,10 @@ def systems():
             f"{row['rmse'] / row['rmse_oracle']:.2f}",
             f"{row['rmse_nominal'] / row['rmse']:.1f}",
         ]
-        name = f"{row['system'].replace('_', ' ')}, {output}"
-        lines.append([name, *(measured(entry, row) for entry in entries)])
-    heads = ["proved rate", "tube", "whole bound", "coverage [%]"]
-    heads += ["RMSE over that of the oracle", "RMSE of nominal over ours"]
+        cells = [measured(entry, row) for entry in entries]
+        back = row.get("back")
+        cells.append("" if back is None else measured(f"{100 * back:.0f}", row))
+        lines.append([f"{name}, {output}", *cells])
     return table(["system, output", *heads], lines)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import benchmarks
 from benchmarks import pages, tables
-from experiments import results
+from experiments import results, systems
 from sfkd_jax import certificate
 from sfkd_jax.driving.certificate import DrivingCertificate
 
@@ -19,6 +19,29 @@ PRETRAINED = results.HOME.parent / "src" / "sfkd_jax" / "pretrained"
 
 def row(name, scenario, label, vehicle, controller="mppi_path_300"):
     return results.of_scenario(name, scenario, (controller,))[label][vehicle]
+
+
+def test_a_script_writes_the_lines_of_systems_into_their_file(tmp_path, monkeypatch):
+    lines = {name: {"system": name} for name in ("c3m/pvtol", "motor")}
+    for name, line in lines.items():
+        file = tmp_path / name / "line.json"
+        file.parent.mkdir(parents=True)
+        file.write_text(json.dumps(line), "utf-8")
+    written = tmp_path / "systems.json"
+    monkeypatch.setattr(systems, "RESULTS", written)
+    monkeypatch.setattr("sys.argv", ["systems", str(tmp_path), "motor", "--write"])
+    systems.main()
+    # In the order of the systems, those of others last.
+    assert json.loads(written.read_text("utf-8")) == [
+        lines["motor"],
+        lines["c3m/pvtol"],
+    ]
+
+
+def test_the_systems_in_their_file_are_among_the_examples():
+    names = [row["system"] for row in pages.read("experiments/systems.json")]
+    assert len(set(names)) == len(names)
+    assert set(names) <= set(systems.SYSTEMS)
 
 
 @pytest.mark.parametrize("name", results.BENCHMARKS)

@@ -13,6 +13,7 @@ from helpers import put, refusal_of
 from loops import DT, FASTEST, LIMIT, frame, loop, mass, pushed, tracked
 
 import sfkd_jax
+from experiments.systems import share_back
 from sfkd_jax.experiment.systems import certify_system
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.policy import SystemPolicy, is_system, restore_system, save_system
@@ -67,6 +68,16 @@ def test_the_policy_is_loaded_with_its_verified_certificate(certified):
     assert f"|position| <= {bounds.total:.4g} m" in lines[-1]
     assert bounds.total == bounds.tube + bounds.nominal
     assert 0.86 - 0.05 < again.certificate.proof.alpha < 1.0
+
+
+def test_starts_come_back_if_the_controls_allow_it(certified):
+    _, policy = certified
+    near = policy.certificate.tubes.outputs["position"].total
+    starts = {"x": (-3.0 * near, 3.0 * near), "v": (-0.1, 0.1)}
+    share = partial(share_back, policy, mass(), duration=5.0, runs=8)
+    assert share(starts) == 1.0
+    # Within 5 s the force moves the mass by 4 / 0.8 * 5**2 / 4 m at most.
+    assert share({"x": (40.0, 50.0)}) == 0.0
 
 
 def written(root):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sfkd_jax.systems import System as System
     from sfkd_jax.systems import integrated as integrated
     from sfkd_jax.systems import regulation as regulation
+    from sfkd_jax.systems import simulated as simulated
     from sfkd_jax.systems import tracking as tracking
 
 __version__ = "0.1.0"
@@ -31,6 +32,7 @@ _LAZY = {
     "Latency": "latency",
     "System": "systems",
     "integrated": "systems",
+    "simulated": "systems",
     "tracking": "systems",
     "regulation": "systems",
     "certify_system": "experiment.systems",

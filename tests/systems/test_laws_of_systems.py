@@ -10,14 +10,16 @@ import pytest
 from loops import FASTEST, MASS, WIND, frame, loop, mass, pushed, steady, tracked
 
 from sfkd_jax.systems import (
+    ClosedLoop,
     NoLaw,
     Tracked,
     _derivation,
+    best_law,
     derive_law,
-    fastest_law,
     regulation,
     steady_states,
 )
+from sfkd_jax.systems._runs import tried
 
 DWELL = (1.0, 4.0)
 
@@ -145,15 +147,36 @@ def test_a_law_contracts_between_the_corners_too(key):
         derive_law(of, steady_states(of, points=5), rate=0.7)
 
 
-def test_the_fastest_law_does_not_saturate(key, monkeypatch):
-    law, rate = fastest_law(tracked(), steady(), key, dwell=DWELL)
+def test_the_best_law_does_not_saturate(key, monkeypatch):
+    law, rate = best_law(tracked(), steady(), key, dwell=DWELL)
     assert rate <= 0.86
     matrices = closed_loops(tracked(), law, places_inside(law, 20, key))
     assert np.abs(np.linalg.eigvals(matrices)).max() <= rate + 1e-3
     monkeypatch.setattr(_derivation, "SATURATED", -1.0)
     monkeypatch.setattr(_derivation, "RATES", (0.8, 0.9))
     with pytest.raises(NoLaw, match=r"saturation: at a rate of 0.9 a control is at"):
-        fastest_law(tracked(), steady(), key, dwell=DWELL)
+        best_law(tracked(), steady(), key, dwell=DWELL)
+
+
+def test_the_best_law_has_the_smallest_errors_of_all(key, monkeypatch):
+    # A fast law answers to the noise of these sensors.
+    noisy = Tracked(mass(states={"x [m]": 0.1, "v [m/s]": 0.1}), frame())
+    table = steady_states(noisy, points=3)
+    rates = (0.75, 0.9, 0.97)
+    trials = {
+        rate: tried(
+            ClosedLoop(noisy, derive_law(noisy, table, rate=rate)),
+            key,
+            steps=300,
+            dwell=DWELL,
+        )
+        for rate in rates
+    }
+    assert max(trial.saturated for trial in trials.values()) <= 0.01
+    monkeypatch.setattr(_derivation, "RATES", rates)
+    _, rate = best_law(noisy, table, key, dwell=DWELL)
+    assert rate == min(rates, key=lambda rate: trials[rate].error)
+    assert rate > rates[0]
 
 
 def test_a_reference_that_asks_for_too_much_is_refused_where_it_does():

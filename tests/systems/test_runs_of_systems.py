@@ -21,7 +21,7 @@ from sfkd_jax.systems import (
     spread_of,
     steady_states,
 )
-from sfkd_jax.systems._runs import saturation
+from sfkd_jax.systems._runs import tried
 from sfkd_jax.types import BODY
 
 DWELL = (1.0, 4.0)
@@ -63,7 +63,7 @@ def test_references_stay_in_their_ranges_and_change_with_the_dwell(name, key):
     draw = jax.jit(jax.vmap(partial(random_reference, of, steps=STEPS)))
     points, rates = draw(jax.random.split(key, 40))
     for state, (low, high) in of.frame.ranges.items():
-        values = np.asarray(points)[..., of.frame.chained.index(state)]
+        values = np.asarray(points)[..., of.frame.followed.index(state)]
         room = ROOM * (high - low)
         assert values.min() >= low - room
         assert values.max() <= high + room
@@ -139,18 +139,18 @@ def test_noise_of_the_sensors_is_what_separates_noisy_runs(key):
 
 
 def test_saturation_is_the_share_of_steps_at_a_limit(key):
-    assert saturation(loop(), key, steps=STEPS, dwell=DWELL) == 0.0
+    assert tried(loop(), key, steps=STEPS, dwell=DWELL).saturated == 0.0
     weak = Tracked(mass(controls={"force [N]": (-1.71, 1.71)}), frame())
     table = steady_states(weak, points=3)
     of = ClosedLoop(weak, derive_law(weak, table, rate=0.75))
-    share = saturation(of, key, steps=STEPS, dwell=DWELL)
-    assert 0.0 < share < 1.0
+    assert 0.0 < tried(of, key, steps=STEPS, dwell=DWELL).saturated < 1.0
 
     def unstable(state, control, env):
         return jnp.full_like(state, jnp.nan)
 
     broken = ClosedLoop(Tracked(mass(unstable), frame()), of.law)
-    assert saturation(broken, key, steps=STEPS, dwell=DWELL) == 1.0
+    trial = tried(broken, key, steps=STEPS, dwell=DWELL)
+    assert trial == (1.0, np.inf)
 
 
 def test_the_spread_is_that_of_runs_from_steady_states(key):

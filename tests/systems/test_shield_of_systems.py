@@ -9,6 +9,7 @@ import pytest
 from helpers import at, same
 from loops import DT, FASTEST, LIMIT, exact_model, frame, loop, mass, pushed
 
+from sfkd_jax.control import NominalState
 from sfkd_jax.geometry import without_pose
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.systems import ClosedLoop, OutputBound, Shield, Tracked
@@ -86,8 +87,9 @@ def driven(of, step, *, start=(0.0, 0.0), steps=STEPS, spoil=None):
         control, state, info = of.act({}, state, *given)
         x = jnp.clip(control, -LIMIT, LIMIT)
         after = step(error, x, ahead[0], env)
-        nominal = of.model.decode(None, state.latent)[3:]
-        return (after, state), (error, control, info, nominal, state.started)
+        started = state.nominal.started
+        nominal = of.model.decode(None, state.nominal.latent)[3:]
+        return (after, state), (error, control, info, nominal, started)
 
     first = (jnp.asarray(start), of.init(jax.random.key(0)))
     run = jax.jit(lambda: jax.lax.scan(body, first, jnp.arange(steps))[1])
@@ -161,7 +163,7 @@ def test_a_control_beyond_the_limits_never_passes():
     error = jnp.asarray([-0.9, -0.9])
     control, state, _ = of.act({}, of.init(jax.random.key(0)), error, ENV, AT_REST)
     assert np.abs(control).max() <= LIMIT
-    assert np.all(np.isfinite(state.latent))
+    assert np.all(np.isfinite(state.nominal.latent))
 
 
 def test_nothing_is_claimed_while_the_nominal_model_is_outside_its_bound():
@@ -169,9 +171,8 @@ def test_nothing_is_claimed_while_the_nominal_model_is_outside_its_bound():
     of = shield(law_and(lambda step: jnp.zeros(1)))
     for x, reason in ((0.075, Reason.INFEASIBLE), (0.055, Reason.CERTIFIED)):
         error = jnp.asarray([x, -0.3])
-        state = of.init(jax.random.key(0))._replace(
-            started=jnp.asarray(True), latent=without_pose(error)
-        )
+        running = NominalState(without_pose(error), jnp.asarray(True), ENV)
+        state = of.init(jax.random.key(0))._replace(nominal=running)
         _, _, info = jax.jit(of.act)({}, state, error, ENV, AT_REST)
         assert float(info.shield.margin) > 0.0
         assert info.claim.reason == reason

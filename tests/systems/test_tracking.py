@@ -7,7 +7,7 @@ import pytest
 from helpers import refusal_of
 from loops import DT, frame, mass, pushed, tracked
 
-from sfkd_jax.systems import Tracked, regulation, tracking
+from sfkd_jax.systems import System, Tracked, integrated, regulation, tracking
 
 NAN = float("nan")
 
@@ -165,6 +165,103 @@ def test_a_frame_that_does_not_fit_is_refused_in_one_line(changed, named):
     assert line is not None
     assert named in line
     assert "none" not in line
+
+
+def boat(drift=0.0, **changed):
+    """A body that moves where it points, in a current that does not turn with it."""
+
+    def rates(state, control, env):
+        yaw, v, _, _ = state
+        sideways = v * jnp.sin(yaw)
+        return [env[0] * control[0], control[1], v * jnp.cos(yaw) + drift, sideways]
+
+    system = System(
+        integrated(rates, dt=DT),
+        dt=DT,
+        states={"yaw [rad]": 0.0, "v [m/s]": 0.0, "x [m]": 0.0, "y [m]": 0.0},
+        controls={"turn [rad/s]": (-2.0, 2.0), "push [m/s²]": (-2.0, 2.0)},
+        environment={"rudder": (0.8, 1.2)},
+    )
+    arguments = {
+        "reference": {("yaw",): (-1.0, 1.0), ("v",): (-0.5, 0.5)},
+        "ranges": {"v": (1.0, 2.0)},
+        "course": ("x", "y", "yaw", "v"),
+        **changed,
+    }
+    return Tracked(system, tracking({"position": ("x", "y")}, **arguments))
+
+
+def test_the_error_of_a_course_turns_with_its_reference(key):
+    of = boat()
+    assert of.frame.followed == ("yaw", "v", "x", "y")
+    assert [of.names[index] for index in of.held] == ["x", "y"]
+    errors, references = jax.random.normal(key, (2, 50, 4))
+    states = jax.vmap(of.state)(errors, references)
+    np.testing.assert_allclose(
+        jax.vmap(of.coordinates)(states, references), errors, atol=1e-5
+    )
+    # What is ahead of a reference that looks along y has a larger y.
+    north = jnp.asarray([0.5 * np.pi, 1.0, 3.0, 4.0])
+    np.testing.assert_allclose(
+        of.state(jnp.asarray([0.0, 0.0, 2.0, 1.0]), north),
+        [0.5 * np.pi, 1.0, 2.0, 6.0],
+        atol=1e-5,
+    )
+
+
+def test_the_reference_of_a_course_moves_along_an_arc():
+    of = boat()
+    rate = 0.8
+    v = 1.5
+    rates = jnp.asarray([rate, 0.0])
+    point = jnp.asarray([0.3, v, 5.0, -2.0])
+    before = point
+    for _ in range(20):
+        before = point
+        point = of.advance(point, rates)
+    yaw = 0.3 + rate * 20 * DT
+    x = 5.0 + v / rate * (np.sin(yaw) - np.sin(0.3))
+    y = -2.0 - v / rate * (np.cos(yaw) - np.cos(0.3))
+    np.testing.assert_allclose(point, [yaw, v, x, y], atol=1e-5)
+    assert of.moves(before, rates, point)
+    # 3 cm to the side are more than the room of a step.
+    assert not of.moves(before, rates, point.at[2].add(0.03))
+
+
+def test_a_step_of_a_course_is_the_same_wherever_its_reference_points(key):
+    of = boat()
+    of.check_invariance(key)
+    error = jnp.asarray([0.2, -0.1, 0.3, -0.4])
+    point = jnp.asarray([2.0, 1.2, -7.0, 3.0])
+    rates = jnp.asarray([0.8, -0.3])
+    control = jnp.asarray([1.0, 0.4])
+    env = jnp.asarray([1.1])
+    after = of.system.step(of.state(error, point), control, env)
+    np.testing.assert_allclose(
+        of.step(error, control, of.inputs(point, rates), env),
+        of.coordinates(after, of.advance(point, rates)),
+        atol=1e-5,
+    )
+    line = refusal_of(lambda: boat(drift=0.5).check_invariance(key))
+    assert line is not None
+    assert "yaw of the reference" in line
+
+
+@pytest.mark.parametrize(
+    ("course", "named"),
+    [
+        (("x", "y", "yaw"), "course: two states"),
+        (("x", "x", "yaw", "v"), "course"),
+        (("x", "y", "yaw", "w"), "course: w is in no chain"),
+        (("yaw", "y", "yaw", "v"), "course"),
+        (("v", "y", "yaw", "x"), "course: v is in a chain"),
+        (("x", "z", "yaw", "v"), "'z'"),
+    ],
+)
+def test_a_course_that_does_not_fit_is_refused_in_one_line(course, named):
+    line = refusal_of(lambda: boat(course=course))
+    assert line is not None
+    assert named in line
 
 
 def test_a_state_is_held_once():

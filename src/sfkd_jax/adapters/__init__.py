@@ -1,7 +1,8 @@
 """Adapters to brax, gymnasium and CommonRoad.
 
 Our vehicles are environments of brax and gymnasium; brax systems and CommonRoad's cars
-are plants. Each adapter, and the package it needs, is imported on first use.
+are plants, and brax systems also systems to certify. A shield wraps any environment of
+gymnasium. Each adapter, and the package it needs, is imported on first use.
 """
 
 from importlib import import_module
@@ -16,14 +17,17 @@ if TYPE_CHECKING:
     from sfkd_jax.adapters._brax import BraxPlant as BraxPlant
     from sfkd_jax.adapters._brax import BraxVehicle as BraxVehicle
     from sfkd_jax.adapters._brax import brax_plant as brax_plant
+    from sfkd_jax.adapters._brax import brax_system as brax_system
     from sfkd_jax.adapters._commonroad import commonroad_vehicle as commonroad_vehicle
     from sfkd_jax.adapters._gymnasium import GymnasiumLane as GymnasiumLane
     from sfkd_jax.adapters._gymnasium import GymnasiumVehicle as GymnasiumVehicle
     from sfkd_jax.adapters._gymnasium import register_gymnasium as register_gymnasium
+    from sfkd_jax.adapters._gymnasium_shield import GymnasiumShield as GymnasiumShield
 
 _LAZY = {
-    ("_brax", "brax"): ("BraxPlant", "BraxVehicle", "brax_plant"),
+    ("_brax", "brax"): ("BraxPlant", "BraxVehicle", "brax_plant", "brax_system"),
     ("_commonroad", "plants"): ("commonroad_vehicle",),
+    ("_gymnasium_shield", "gym"): ("GymnasiumShield",),
     ("_gymnasium", "gym"): ("GymnasiumLane", "GymnasiumVehicle", "register_gymnasium"),
 }
 """File and the extra that installs what it imports -> its public names."""

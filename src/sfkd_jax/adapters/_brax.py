@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -13,6 +13,8 @@ from brax.envs.base import State as BraxState
 from brax.generalized import pipeline
 
 from sfkd_jax.adapters._task import MEASURES, DrivingTask
+from sfkd_jax.geometry import without_pose
+from sfkd_jax.systems import System, split_label
 from sfkd_jax.types import BODY, Control, Environment, Key, Reference, State, Step
 
 SCALED = {
@@ -183,6 +185,48 @@ def brax_plant(env: Env, *, parameters: tuple[str, ...] = ("gravity",)) -> BraxP
         parameters=parameters,
         step=step,
         start=start,
+    )
+
+
+def brax_system(
+    env: Env,
+    *,
+    states: Mapping[str, float],
+    controls: Sequence[str],
+    environment: Mapping[str, tuple[float, float]],
+) -> System:
+    """Return a brax system for `certify_system`; its states are q and q̇.
+
+    Args:
+        env: see `brax_plant`.
+        states: names of all entries of q and then of q̇ -> deviations of their sensors.
+        controls: names of the motors, whose limits are those of the brax system.
+        environment: the parameters that e scales, see `brax_plant` -> lower and upper
+            end of the factor.
+
+    Raises:
+        ValueError: the names do not fit, or `brax_plant` refuses.
+    """
+    parameters = tuple(split_label(label)[0] for label in environment)
+    plant = brax_plant(env, parameters=parameters)
+    for what, names, size in (
+        ("states", states, len(plant.state_names) - 3),
+        ("controls", controls, len(plant.control_low)),
+    ):
+        if len(names) != size:
+            raise ValueError(f"{what}: {size} names, got {len(names)}")
+
+    def step(state: State, control: Control, env: Environment) -> State:
+        return plant.step(without_pose(state), control, env)[BODY]
+
+    limits = zip(plant.control_low, plant.control_high, strict=True)
+    return System(
+        step,
+        dt=plant.dt,
+        states=states,
+        controls=dict(zip(controls, limits, strict=True)),
+        environment=environment,
+        name=type(env.unwrapped).__name__.lower(),
     )
 
 

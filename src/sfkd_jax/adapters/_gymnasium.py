@@ -69,6 +69,10 @@ class GymnasiumVehicle(gymnasium.Env):
         """Return what `Controller.act` takes: state, e, and what is ahead."""
         return self._task.situation(*self._reached())
 
+    def control(self, action: Any) -> np.ndarray:
+        """Return an action in [-1, 1] as a control of the vehicle."""
+        return np.asarray(self._task.control(jax.numpy.asarray(action, np.float32)))
+
     def action(self, control: Any) -> np.ndarray:
         """Return a control of the vehicle as an action in [-1, 1]."""
         return np.asarray(self._task.action(jax.numpy.asarray(control, np.float32)))

@@ -1,8 +1,14 @@
 """Planners, and the tasks that they solve, for any dynamics."""
 
+from sfkd_jax.control._around_law import AroundLaw as AroundLaw
+from sfkd_jax.control._around_law import LawTarget as LawTarget
 from sfkd_jax.control._factory import Stateful as Stateful
 from sfkd_jax.control._factory import factory as factory
 from sfkd_jax.control._finite import all_finite as all_finite
+from sfkd_jax.control._nominal_model import Comparison as Comparison
+from sfkd_jax.control._nominal_model import Nominal as Nominal
+from sfkd_jax.control._nominal_model import NominalModel as NominalModel
+from sfkd_jax.control._nominal_model import NominalState as NominalState
 from sfkd_jax.control._safety_filter import FILTER_SCALES as FILTER_SCALES
 from sfkd_jax.control._safety_filter import FilterResult as FilterResult
 from sfkd_jax.control._safety_filter import safety_filter as safety_filter

@@ -27,11 +27,13 @@ class Scene(NamedTuple):
         reference: states of the reference, horizon steps longer than the run.
         envs: e of every step.
         noise: of the sensors, at every step.
+        start: state at the beginning.
     """
 
     reference: Float[Array, "point reference"]
     envs: Float[Array, "time environment"]
     noise: Float[Array, "time state"]
+    start: State
 
 
 class SystemRuns(NamedTuple):
@@ -65,7 +67,7 @@ class SystemRuns(NamedTuple):
 def random_scenes(
     policy: SystemPolicy, key: Key, *, runs: AtLeastOne, duration: Positive
 ) -> Scene:
-    """Draw scenes of the class that a certificate is about.
+    """Draw scenes of the class that a certificate is about, from their steady states.
 
     Args:
         policy: whose certificate states the class.
@@ -84,14 +86,17 @@ def random_scenes(
         reference = random_reference(
             tracked, reference_key, steps=steps + policy.horizon
         )
-        shape = (steps, len(tracked.names))
+        envs = random_switching(
+            env_key, steps=steps, dt=system.dt, low=low, high=high, dwell=dwell
+        )
+        inputs = tracked.inputs(reference.points[0], reference.rates[0])
+        steady = policy.loop.law.at(inputs, envs[0]).state
+        noise = jax.random.normal(noise_key, (steps, len(tracked.names)))
         return Scene(
             reference=reference.points,
-            envs=random_switching(
-                env_key, steps=steps, dt=system.dt, low=low, high=high, dwell=dwell
-            ),
-            noise=jnp.asarray(system.sensor_noise)
-            * jax.random.normal(noise_key, shape),
+            envs=envs,
+            noise=jnp.asarray(system.sensor_noise) * noise,
+            start=tracked.state(steady, reference.points[0]),
         )
 
     return jax.jit(jax.vmap(scene))(jax.random.split(key, runs))
@@ -105,7 +110,7 @@ def run_controller(
     scenes: Scene,
     key: Key,
 ) -> SystemRuns:
-    """Simulate a controller in the scenes, each from its steady state.
+    """Simulate a controller in the scenes.
 
     Args:
         policy: whose frame, law and outputs are used.
@@ -119,8 +124,6 @@ def run_controller(
     rows = list(tracked.rows.values())
 
     def run(params: Params, scene: Scene, key: Key) -> SystemRuns:
-        start = _start(policy.loop, scene)
-
         def advance(carry: Any, at: Any) -> tuple[Any, tuple[Array, Array]]:
             state, inner = carry
             index, env, noise = at
@@ -136,7 +139,7 @@ def run_controller(
             return (step(state, control, env), inner), (errors, bounds)
 
         steps = jnp.arange(len(scene.envs))
-        carry = (start, controller.init(key))
+        carry = (scene.start, controller.init(key))
         _, recorded = jax.lax.scan(advance, carry, (steps, scene.envs, scene.noise))
         return SystemRuns(*recorded)
 
@@ -188,14 +191,6 @@ def compare_system(
     for name, controller in others.items():
         result[f"rmse_{name}"] = drive(controller=controller, params={}).rmse()
     return result
-
-
-def _start(loop: ClosedLoop, scene: Scene) -> State:
-    """Return the state of a system that follows the reference of a scene."""
-    tracked = loop.tracked
-    rates = tracked.rates_between(scene.reference[:2])[0]
-    inputs = tracked.inputs(scene.reference[0], rates)
-    return tracked.state(loop.law.at(inputs, scene.envs[0]).state, scene.reference[0])
 
 
 def _law_alone(loop: ClosedLoop) -> Controller:

@@ -31,8 +31,8 @@ from sfkd_jax.systems import (
     SystemCertificate,
     Tracked,
     Tracking,
+    best_law,
     derive_law,
-    fastest_law,
     random_runs,
     spread_of,
     steady_states,
@@ -111,7 +111,7 @@ class SystemRun:
                 perturbation=settings.perturbation,
             )
             return ClosedLoop(self.tracked, law)
-        law, rate = fastest_law(
+        law, rate = best_law(
             self.tracked,
             steady,
             self.key(0),

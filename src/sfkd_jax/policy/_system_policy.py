@@ -87,7 +87,7 @@ class SystemPolicy(TrainedSystem):
     @property
     def reference_names(self) -> tuple[str, ...]:
         """Names of the states that a reference has."""
-        return self.loop.tracked.frame.chained
+        return self.loop.tracked.frame.followed
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -148,6 +148,7 @@ def describe_system(tracked: Tracked) -> dict[str, Any]:
             "ranges": {name: list(ends) for name, ends in frame.ranges.items()},
             "dwell": list(frame.dwell),
             "held": list(frame.held),
+            "course": list(frame.course),
         },
     }
 
@@ -312,6 +313,7 @@ def _tracked_from(settings: Values) -> Tracked:
             ranges=ranges(frame["ranges"]),
             dwell=tuple(frame["dwell"]),
             held=tuple(frame["held"]),
+            course=tuple(frame.get("course", ())),
         ),
     )
 

@@ -6,8 +6,8 @@ from sfkd_jax.systems._certificate import OutputBounds as OutputBounds
 from sfkd_jax.systems._certificate import SystemCertificate as SystemCertificate
 from sfkd_jax.systems._closed_loop import ClosedLoop as ClosedLoop
 from sfkd_jax.systems._controller import Following as Following
+from sfkd_jax.systems._derivation import best_law as best_law
 from sfkd_jax.systems._derivation import derive_law as derive_law
-from sfkd_jax.systems._derivation import fastest_law as fastest_law
 from sfkd_jax.systems._frame import Tracking as Tracking
 from sfkd_jax.systems._frame import regulation as regulation
 from sfkd_jax.systems._frame import tracking as tracking
@@ -19,11 +19,13 @@ from sfkd_jax.systems._runs import random_runs as random_runs
 from sfkd_jax.systems._runs import spread_of as spread_of
 from sfkd_jax.systems._shield import OutputBound as OutputBound
 from sfkd_jax.systems._shield import Shield as Shield
+from sfkd_jax.systems._simulated import simulated as simulated
 from sfkd_jax.systems._steady_states import NoLaw as NoLaw
 from sfkd_jax.systems._steady_states import SteadyStates as SteadyStates
 from sfkd_jax.systems._steady_states import steady_states as steady_states
 from sfkd_jax.systems._system import System as System
 from sfkd_jax.systems._system import integrated as integrated
+from sfkd_jax.systems._system import split_label as split_label
 from sfkd_jax.systems._task import TrackingTask as TrackingTask
 from sfkd_jax.systems._task import tracking_task as tracking_task
 from sfkd_jax.systems._tracking import Tracked as Tracked

@@ -19,7 +19,7 @@ class Following(Stateful):
     """A controller that sees states and a reference, from one that sees ξ and ρ.
 
     The reference of a step consists of the states of the reference now and at the next
-    sampling times, (horizon + 1, reference), chain after chain.
+    sampling times, (horizon + 1, reference), in the order of `Tracking.followed`.
 
     Attributes:
         inner: its `act` takes ξ and ρ (horizon, inputs).
@@ -69,9 +69,9 @@ class Following(Stateful):
                 f"env must have shape ({len(entries)},): {', '.join(entries)}; "
                 f"got {jnp.shape(env)}"
             )
-        chained = tracked.frame.chained
-        if jnp.ndim(reference) != 2 or jnp.shape(reference)[1] != len(chained):
+        followed = tracked.frame.followed
+        if jnp.ndim(reference) != 2 or jnp.shape(reference)[1] != len(followed):
             raise ValueError(
-                f"reference must have shape (horizon + 1, {len(chained)}): "
-                f"{', '.join(chained)}; got {jnp.shape(reference)}"
+                f"reference must have shape (horizon + 1, {len(followed)}): "
+                f"{', '.join(followed)}; got {jnp.shape(reference)}"
             )

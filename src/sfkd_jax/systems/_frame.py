@@ -20,6 +20,13 @@ class Tracking:
     no chain, such as the roll of a quadrotor, stay as they are in ξ. A chain of one
     state is a set point that moves at a limited rate.
 
+    A body that moves where it points, such as a car, has a course: the two entries of
+    its position, its heading, and its speed. Then the position of the reference moves
+    with the speed of the reference in the direction of its heading, and the entries of
+    the position in ξ are along the reference and to its left:
+
+        ṗ_ref = v_ref (cos ψ_ref, sin ψ_ref),   ξ_p = R(ψ_ref)' (p - p_ref)
+
     Attributes:
         outputs: name -> states; of each output a tube is certified.
         reference: chain of one or two states -> range of the rate of the last of them.
@@ -28,7 +35,10 @@ class Tracking:
             the angle of a pendulum. The law and the model then depend on it.
         dwell: shortest and longest time between two changes of the reference [s].
         held: states whose ξ is 0 where the system follows its reference, as many as
-            there are controls; () for the first state of every chain.
+            there are controls; () for the first state of every chain, and for the
+            position in place of heading and speed where there is a course.
+        course: two states of a position, heading and speed; the last two are in chains.
+            () if no body moves where it points.
 
     Raises:
         ValueError: a chain, a range or an output does not fit; gives the reason.
@@ -40,6 +50,7 @@ class Tracking:
     ranges: Mapping[str, Ends]
     dwell: tuple[float, float]
     held: tuple[str, ...] = ()
+    course: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.outputs or not self.reference:
@@ -57,6 +68,7 @@ class Tracking:
             check_ends(f"reference: the rate of {chain[-1]}", ends)
             if not ends[0] < 0.0 < ends[1]:
                 raise ValueError(f"reference: the rate of {chain[-1]} has no 0 inside")
+        _check_course(self.course, listed)
         for state, ends in self.ranges.items():
             if state not in listed:
                 raise ValueError(f"ranges: {state} is in no chain of the reference")
@@ -71,9 +83,16 @@ class Tracking:
         _check_dwell(self.dwell)
 
     @property
-    def chained(self) -> tuple[str, ...]:
-        """The states of the reference, chain after chain."""
-        return tuple(state for chain in self.reference for state in chain)
+    def followed(self) -> tuple[str, ...]:
+        """The states of the reference: those of the chains, and a course's position."""
+        chained = tuple(state for chain in self.reference for state in chain)
+        return (*chained, *self.course[:2])
+
+    @property
+    def held_by_default(self) -> tuple[str, ...]:
+        """The position of a course, and the first state of every other chain."""
+        first = [chain[0] for chain in self.reference if not {*chain} & {*self.course}]
+        return (*self.course[:2], *first)
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -96,6 +115,7 @@ def tracking(
     ranges: Mapping[str, Ends] | None = None,
     dwell: tuple[float, float] = (0.5, 2.0),
     held: tuple[str, ...] = (),
+    course: tuple[str, ...] = (),
 ) -> Tracking:
     """Return coordinates relative to a reference that moves; see `Tracking`."""
     return Tracking(
@@ -104,6 +124,7 @@ def tracking(
         ranges=ranges or {},
         dwell=dwell,
         held=held,
+        course=course,
     )
 
 
@@ -141,6 +162,23 @@ def _check_states(what: str, states: Any) -> None:
     is_sequence = isinstance(states, tuple | list) and len(states) > 0
     if not (is_sequence and all(isinstance(state, str) for state in states)):
         raise ValueError(f'{what} is states as in ("x", "y"), got {states!r}')
+
+
+def _check_course(course: Any, chained: list[str]) -> None:
+    """Raise a ValueError unless this is a course with heading and speed in chains."""
+    if course == ():
+        return
+    _check_states("course", course)
+    if len(course) != 4 or len(set(course)) < 4:
+        raise ValueError(
+            f"course: two states of a position, heading and speed, got {course}"
+        )
+    for state in course[:2]:
+        if state in chained:
+            raise ValueError(f"course: {state} is in a chain, and in the position too")
+    for state in course[2:]:
+        if state not in chained:
+            raise ValueError(f"course: {state} is in no chain of the reference")
 
 
 def _check_dwell(dwell: Any) -> None:

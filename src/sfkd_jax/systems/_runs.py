@@ -33,6 +33,10 @@ SLOWEST = 0.95
 """Largest autocorrelation of ν from a step to the next."""
 TRIALS = 64
 """Number of runs that tell how far a loop moves, and whether it saturates."""
+QUANTILE = 0.95
+"""Share of the trial runs whose errors count."""
+TINY = 1e-12
+"""Error that is none."""
 ROUNDING = 1e-4
 """Share of the range of a control that counts as its limit."""
 BRAKING = 0.8
@@ -90,13 +94,13 @@ def random_reference(tracked: Tracked, key: Key, *, steps: int) -> Reference:
         after = tracked.advance(point, rates)
         return after, (after, rates)
 
-    start = jnp.zeros(len(tracked.chained))
+    start = jnp.zeros(len(tracked.followed))
     # A chain that moves between places begins at rest, or it could leave its range.
     at_rest = {chain[1:] for chain in frame.reference if chain[0] in frame.ranges}
     for state, ends in frame.ranges.items():
         if (state,) in at_rest:
             continue
-        index = frame.chained.index(state)
+        index = frame.followed.index(state)
         draw = within(ends, jax.random.fold_in(start_key, index))
         start = start.at[index].set(draw)
     _, (after, rates) = jax.lax.scan(step, start, goals)
@@ -319,12 +323,32 @@ def spread_of(
     return jnp.std(deviations.reshape(-1, len(loop.tracked.names)), axis=0)
 
 
-def saturation(loop: ClosedLoop, key: Key, *, steps: int, dwell: Span) -> float:
-    """Return the share of steps in which a control is at its limit.
+class Trial(NamedTuple):
+    """What runs that begin at steady states say of a law.
 
-    It is 1 if a run is not finite.
+    Attributes:
+        saturated: share of the steps in which a control is at its limit; 1 if a run is
+            not finite.
+        error: geometric mean over the outputs of the largest |y| of a run, which
+            `QUANTILE` of the runs stay below.
+    """
+
+    saturated: float
+    error: float
+
+
+def tried(loop: ClosedLoop, key: Key, *, steps: int, dwell: Span) -> Trial:
+    """Simulate a few runs of a law.
+
+    Args:
+        loop: the system with its law.
+        key: consumed.
+        steps: of each run.
+        dwell: shortest and longest time between two switches of e [s].
     """
     runs = _from_steady(loop, key, steps, dwell)
+    if not jnp.all(jnp.isfinite(runs.states)):
+        return Trial(saturated=1.0, error=float("inf"))
 
     def at_limit(state: State, control: Control, env: Environment) -> Array:
         nu, inputs = loop.split(control)
@@ -336,5 +360,12 @@ def saturation(loop: ClosedLoop, key: Key, *, steps: int, dwell: Span) -> float:
     limited = jax.vmap(jax.vmap(at_limit))(
         runs.states[:, :-1], runs.controls, runs.envs
     )
-    finite = jnp.all(jnp.isfinite(runs.states))
-    return float(jnp.where(finite, jnp.mean(limited), 1.0))
+    errors = runs.states[..., BODY]
+    logarithms = []
+    for entries in loop.tracked.rows.values():
+        sizes = jnp.linalg.norm(errors[..., list(entries)], axis=-1).max(axis=1)
+        logarithms.append(jnp.log(jnp.quantile(sizes, QUANTILE) + TINY))
+    return Trial(
+        saturated=float(jnp.mean(limited)),
+        error=float(jnp.exp(jnp.mean(jnp.stack(logarithms)))),
+    )

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.control import FilterResult, Stateful, all_finite, safety_filter, size_of
-from sfkd_jax.geometry import without_pose
+from sfkd_jax.control import (
+    Comparison,
+    FilterResult,
+    NominalModel,
+    NominalState,
+    Stateful,
+    all_finite,
+    safety_filter,
+    size_of,
+)
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne
-from sfkd_jax.rollout import fold
 from sfkd_jax.systems._closed_loop import ClosedLoop
 from sfkd_jax.systems._law import SteadyState
 from sfkd_jax.systems._tracking import Error, Inputs
@@ -25,7 +30,6 @@ from sfkd_jax.types import (
     Controller,
     Environment,
     Key,
-    Latent,
     Model,
     Params,
 )
@@ -51,17 +55,12 @@ class ShieldState(NamedTuple):
 
     Attributes:
         inner: state of the wrapped controller.
-        latent: of the nominal model, in the fibre of `env`.
-        started: whether the nominal model is running. Otherwise it starts anew at the
-            next measurement.
-        env: e of the last step, in its box.
+        nominal: of the nominal model.
         inputs: ρ of the last step.
     """
 
     inner: Any
-    latent: Latent
-    started: Bool[Array, ""]
-    env: Environment
+    nominal: NominalState
     inputs: Inputs
 
 
@@ -69,21 +68,15 @@ class _Compared(NamedTuple):
     """The nominal model beside a measurement.
 
     Attributes:
+        with_system: the comparison of |y − ŷ| of each output.
         error: ξ, as measured where it is, and of the nominal model elsewhere.
-        latent: of the nominal model, which starts anew where it has to.
-        fiber: of e.
         running: whether there is a nominal model.
-        distance: |y − ŷ| of each output; NaN without a comparison.
-        exceeded: whether a distance is larger than what is certified.
         kept: whether |ŷ| is within its bound now.
     """
 
+    with_system: Comparison
     error: Error
-    latent: Latent
-    fiber: Any
     running: Bool[Array, ""]
-    distance: Float[Array, " output"]
-    exceeded: Bool[Array, ""]
     kept: Bool[Array, ""]
 
 
@@ -128,20 +121,10 @@ class Shield(Stateful):
     def init(self, key: Key) -> ShieldState:
         """Return the state before the first control step."""
         tracked = self.loop.tracked
-        low, high = map(jnp.asarray, tracked.system.env_box)
-        middle = 0.5 * (low + high)
-
-        def encode(params: Params) -> Latent:
-            fiber = self.model.fiber(params, middle)
-            return self.model.encode(fiber, without_pose(jnp.zeros(len(tracked.names))))
-
-        # Only shapes are evaluated.
-        latent = jax.eval_shape(encode, jax.eval_shape(self.model.init, key))
+        environments = len(tracked.system.environment)
         return ShieldState(
             inner=self.inner.init(key),
-            latent=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), latent),
-            started=jnp.asarray(False),
-            env=middle,
+            nominal=self._nominal.init(key, len(tracked.names), environments),
             inputs=jnp.mean(jnp.asarray(tracked.frame.input_box), axis=0),
         )
 
@@ -154,8 +137,10 @@ class Shield(Stateful):
         inputs: Float[Array, "horizon inputs"],
     ) -> tuple[Control, ShieldState, ControllerInfo]:
         """Take one control step."""
-        known_env = jnp.where(jnp.isfinite(env), env, state.env)
         low, high = map(jnp.asarray, self.loop.tracked.system.env_box)
+        last_env = state.nominal.env
+        last_env = jnp.where(jnp.isfinite(last_env), last_env, 0.5 * (low + high))
+        known_env = jnp.where(jnp.isfinite(env), env, last_env)
         inside = jnp.clip(known_env, low, high)
         known = jnp.where(jnp.isfinite(inputs), inputs, state.inputs)
         steady = self.loop.law.at(known[0], inside)
@@ -180,11 +165,10 @@ class Shield(Stateful):
             (~jnp.all(jnp.isfinite(error)), Reason.NOT_MEASURED),
             (~compared.running, Reason.NOT_STARTED),
             (outside, Reason.OUTSIDE_BOX),
-            (compared.exceeded, Reason.BOUND_EXCEEDED),
+            (compared.with_system.exceeded, Reason.BOUND_EXCEEDED),
             (~passed.feasible | ~compared.kept, Reason.INFEASIBLE),
         )
-        after = self._after(params, compared, control, steady, known[0], reason)
-        latent = self.model.decode(compared.fiber, compared.latent)[BODY]
+        nominal = compared.with_system.nominal
         info = info._replace(
             plan=info.plan._replace(healthy=usable),
             claim=self._claim(reason),
@@ -193,12 +177,18 @@ class Shield(Stateful):
                 margin=jnp.where(compared.running, passed.margin, jnp.nan),
                 intervention=jnp.where(changed, 1.0 - passed.scale, 0.0),
                 perturbation=control - law_control,
-                nominal_state=jnp.where(compared.running, latent, jnp.nan),
-                nominal_distance=compared.distance,
+                nominal_state=jnp.where(compared.running, nominal.state, jnp.nan),
+                nominal_distance=compared.with_system.distance,
                 rolling=jnp.zeros(()),
             ),
         )
-        return control, after._replace(inner=inner, env=inside, inputs=known[0]), info
+        effective = control - steady.feedback(compared.error)
+        after = ShieldState(
+            inner=inner,
+            nominal=self._after(compared, effective, inside, known[0], reason),
+            inputs=known[0],
+        )
+        return control, after, info
 
     def _passed(
         self,
@@ -211,8 +201,8 @@ class Shield(Stateful):
         last = inputs.shape[0] - 1
         return safety_filter(
             self.model,
-            compared.fiber,
-            compared.latent,
+            compared.with_system.nominal.fiber,
+            compared.with_system.nominal.latent,
             request,
             inputs[jnp.minimum(jnp.arange(self.horizon), last)],
             limit,
@@ -226,6 +216,11 @@ class Shield(Stateful):
         """Entries of ξ of the outputs, in the order of the bounds."""
         return [self.loop.tracked.rows[name] for name in self.bounds]
 
+    @property
+    def _nominal(self) -> NominalModel:
+        """The model that the shield keeps inside its bounds."""
+        return NominalModel(self.model, self._rows)
+
     def _compare(
         self,
         params: Params,
@@ -235,41 +230,27 @@ class Shield(Stateful):
         steady: SteadyState,
     ) -> _Compared:
         """Return the nominal model beside a measurement."""
-        model = self.model
-        folded = fold(model, params)
-        fiber = model.fiber(folded, env)
-        before = model.fiber(folded, state.env)
-        latent = model.transport(before, fiber, state.latent)
-        nominal = model.decode(fiber, latent)[BODY]
+        started = state.nominal.started
+        nominal = self._nominal.carried(params, state.nominal, env)
         # Before the first measurement the system is taken to follow its reference.
-        expected = jnp.where(state.started, nominal, steady.state)
+        expected = jnp.where(started, nominal.state, steady.state)
         complete = jnp.where(jnp.isfinite(error), error, expected)
         measured = all_finite(error)
         noise = SIGMAS * jnp.asarray(self.loop.tracked.system.sensor_noise)
-        distance = jnp.stack([size_of(complete - nominal, rows) for rows in self._rows])
-        allowed = jnp.stack(
-            [
-                bound.tube + size_of(noise, rows)
-                for bound, rows in zip(self.bounds.values(), self._rows, strict=True)
-            ]
+        allowed = [
+            bound.tube + size_of(noise, rows)
+            for bound, rows in zip(self.bounds.values(), self._rows, strict=True)
+        ]
+        compared = self._nominal.compare(
+            nominal, complete, jnp.stack(allowed), started=started, measured=measured
         )
-        compared = state.started & measured
-        # Written so that a distance of NaN exceeds the bound.
-        exceeded = compared & ~jnp.all(distance <= allowed)
-        starts = (~state.started & measured) | exceeded
-        anchor = model.encode(fiber, without_pose(complete))
-        now = jax.tree.map(partial(jnp.where, starts), anchor, latent)
-        state_now = model.decode(fiber, now)[BODY]
-        sizes = jnp.stack([size_of(state_now, rows) for rows in self._rows])
+        sizes = [size_of(compared.nominal.state, rows) for rows in self._rows]
         widths = jnp.asarray([bound.nominal for bound in self.bounds.values()])
         return _Compared(
+            with_system=compared,
             error=complete,
-            latent=now,
-            fiber=fiber,
-            running=state.started | starts,
-            distance=jnp.where(compared, distance, jnp.nan),
-            exceeded=exceeded,
-            kept=jnp.all(sizes <= (1.0 + ROUNDING) * widths),
+            running=started | measured,
+            kept=jnp.all(jnp.stack(sizes) <= (1.0 + ROUNDING) * widths),
         )
 
     def _outside(self, error: Error, inputs: Inputs) -> Bool[Array, ""]:
@@ -286,28 +267,21 @@ class Shield(Stateful):
 
     def _after(
         self,
-        params: Params,
         compared: _Compared,
-        control: Control,
-        steady: SteadyState,
+        nu: Control,
+        env: Environment,
         inputs: Inputs,
         reason: Array,
-    ) -> ShieldState:
+    ) -> NominalState:
         """Return the nominal model one sampling period later."""
-        effective = control - steady.feedback(compared.error)
-        given = jnp.concatenate([effective, inputs])
-        latent = self.model.step(compared.fiber, compared.latent, given)
+        nominal = compared.with_system.nominal
+        given = jnp.concatenate([nu, inputs])
+        latent = self.model.step(nominal.fiber, nominal.latent, given)
         goes_on = (reason == Reason.CERTIFIED) | (reason == Reason.INFEASIBLE)
         # Where a reading or an input is missing, the nominal model goes on with what is
         # known; nothing is claimed meanwhile.
         goes_on |= compared.running & (reason <= Reason.NOT_MEASURED)
-        return ShieldState(
-            inner=(),
-            latent=latent,
-            started=goes_on & all_finite(latent),
-            env=jnp.zeros(0),
-            inputs=inputs,
-        )
+        return NominalState(latent, goes_on & all_finite(latent), env)
 
     def _claim(self, reason: Array) -> Claim:
         """Return what is claimed of this step: a bound of |y| for each output."""

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sfkd_jax.geometry import wrap_angle
+from sfkd_jax.geometry import rotate, wrap_angle
 from sfkd_jax.systems._frame import Tracking
 from sfkd_jax.systems._system import System
 from sfkd_jax.types import BODY, Control, Environment, Frame, Key, State
 
 ReferenceState: TypeAlias = Float[Array, " reference"]
-"""The states that the reference has, in the order of the chains."""
+"""The states that the reference has, in the order of `Tracking.followed`."""
 Inputs: TypeAlias = Float[Array, " inputs"]
 """ρ: the last derivative of each chain, then the states of the reference with a range.
 """
@@ -54,7 +54,7 @@ class Tracked:
 
     def __post_init__(self) -> None:
         frame = self.frame
-        named = [*frame.chained, *frame.held]
+        named = [*frame.followed, *frame.held, *frame.course]
         for states in frame.outputs.values():
             named.extend(states)
         for state in named:
@@ -78,13 +78,24 @@ class Tracked:
     @cached_property
     def held(self) -> tuple[int, ...]:
         """Entries of ξ that are 0 where the system follows its reference."""
-        states = self.frame.held or tuple(chain[0] for chain in self.frame.reference)
+        states = self.frame.held or self.frame.held_by_default
         return tuple(self.names.index(state) for state in states)
 
     @cached_property
-    def chained(self) -> tuple[int, ...]:
+    def followed(self) -> tuple[int, ...]:
         """Entries of the state that the reference has."""
-        return tuple(self.names.index(state) for state in self.frame.chained)
+        return tuple(self.names.index(state) for state in self.frame.followed)
+
+    @cached_property
+    def position(self) -> np.ndarray:
+        """The two entries of the position of a course; none without a course."""
+        course = self.frame.course[:2]
+        return np.asarray([self.names.index(state) for state in course], int)
+
+    @cached_property
+    def _course_of(self) -> tuple[int, ...]:
+        """Entries of the reference that are the heading and the speed of a course."""
+        return tuple(map(self.frame.followed.index, self.frame.course[2:]))
 
     @property
     def middle(self) -> ReferenceState:
@@ -126,19 +137,21 @@ class Tracked:
         error = state - self._whole(reference)
         is_angle = [variable.is_angle for variable in self.system.state_variables]
         # An angle that the reference does not have is no difference, and stays.
-        wraps = np.isin(np.arange(len(self.names)), self.chained) & np.asarray(is_angle)
-        return jnp.where(wraps, wrap_angle(error), error)
+        is_followed = np.isin(np.arange(len(self.names)), self.followed)
+        wraps = is_followed & np.asarray(is_angle)
+        error = jnp.where(wraps, wrap_angle(error), error)
+        return self._turned(error, reference, -1.0)
 
     def state(self, error: Error, reference: ReferenceState) -> State:
         """Return the state with this ξ."""
-        return error + self._whole(reference)
+        return self._turned(error, reference, 1.0) + self._whole(reference)
 
     def inputs(
         self, reference: ReferenceState, rates: Float[Array, " chain"]
     ) -> Inputs:
         """Return ρ of a reference and the rates of its chains."""
-        chained = self.frame.chained
-        ranged = [reference[chained.index(state)] for state in self.frame.ranges]
+        followed = self.frame.followed
+        ranged = [reference[followed.index(state)] for state in self.frame.ranges]
         return jnp.concatenate([rates, jnp.stack(ranged)]) if ranged else rates
 
     def advance(
@@ -146,16 +159,14 @@ class Tracked:
     ) -> ReferenceState:
         """Return the reference one sampling period later, at constant rates."""
         dt = self.system.dt
-        after = []
-        for chain, rate in zip(self.frame.reference, rates, strict=True):
-            first = reference[len(after)]
-            if len(chain) == 1:
-                after.append(first + rate * dt)
-                continue
-            second = reference[len(after) + 1]
-            after.append(first + second * dt + 0.5 * rate * dt**2)
-            after.append(second + rate * dt)
-        return jnp.stack(after)
+        after = self._chains(reference, rates, dt)
+        if not self.frame.course:
+            return after
+        # Simpson's rule, which is Runge-Kutta of order 4 of the course.
+        halfway = self._chains(reference, rates, 0.5 * dt)
+        velocities = [self._velocity(at) for at in (reference, halfway, after)]
+        velocity = (velocities[0] + 4.0 * velocities[1] + velocities[2]) / 6.0
+        return jnp.concatenate([after, reference[len(after) :] + velocity * dt])
 
     def moves(
         self,
@@ -173,10 +184,19 @@ class Tracked:
         for chain, (low, high) in self.frame.reference.items():
             room = BESIDE * (high - low) * dt
             rooms.extend([0.5 * room * dt, room] if len(chain) == 2 else [room])
+        sizes = jnp.abs(reference)
+        if self.frame.course:
+            # Of a turn and of a change of speed within the rooms above.
+            speed = jnp.linalg.norm(self._velocity(reference))
+            of_heading = rooms[self._course_of[0]]
+            of_speed = rooms[self._course_of[1]]
+            rooms.extend([(speed * of_heading + of_speed) * dt] * 2)
+            # In the axes of the reference each entry has the rounding of both.
+            sizes = sizes.at[-2:].set(jnp.max(sizes[-2:]))
         epsilon = jnp.finfo(reference.dtype).eps
-        room = jnp.asarray(rooms) + 4.0 * epsilon * (jnp.abs(reference) + 1.0)
+        room = jnp.asarray(rooms) + 4.0 * epsilon * (sizes + 1.0)
         expected = self._whole(self.advance(reference, rates))
-        apart = self.coordinates(expected, after)[np.asarray(self.chained)]
+        apart = self.coordinates(expected, after)[np.asarray(self.followed)]
         return jnp.all(jnp.abs(apart) <= room)
 
     def step(
@@ -198,7 +218,7 @@ class Tracked:
         """Return the rates of the chains between the points of a reference."""
         last = np.cumsum([len(chain) for chain in self.frame.reference]) - 1
         variables = self.system.state_variables
-        wraps = [variables[self.chained[index]].is_angle for index in last]
+        wraps = [variables[self.followed[index]].is_angle for index in last]
         change = jnp.diff(reference[:, last], axis=0)
         # The angles of a reference may be wrapped.
         return jnp.where(np.asarray(wraps), wrap_angle(change), change) / self.system.dt
@@ -223,7 +243,7 @@ class Tracked:
             along = jax.jit(jax.vmap(moved, in_axes=(0, None)))
             start = along(places, middle)
             scale = jnp.max(jnp.abs(start), axis=0)
-            for index, state in enumerate(self.frame.chained):
+            for index, state in enumerate(self.frame.followed):
                 if state in self.frame.ranges:
                     continue
                 beside = middle.at[index].add(1.0)
@@ -247,7 +267,42 @@ class Tracked:
     def _whole(self, reference: ReferenceState) -> State:
         """Return a state that is that of the reference, and 0 elsewhere."""
         whole = jnp.zeros(len(self.names), reference.dtype)
-        return whole.at[np.asarray(self.chained)].set(reference)
+        return whole.at[np.asarray(self.followed)].set(reference)
+
+    def _turned(self, error: Error, reference: ReferenceState, side: float) -> Error:
+        """Return an error whose position is turned by the heading of the reference.
+
+        Args:
+            error: in either axes.
+            reference: with the heading.
+            side: 1 from the axes of the reference to those of the world, -1 back.
+        """
+        if not self.frame.course:
+            return error
+        heading = side * reference[self._course_of[0]]
+        turned = rotate(heading, error[self.position])
+        return error.at[self.position].set(turned)
+
+    def _chains(
+        self, reference: ReferenceState, rates: Float[Array, " chain"], time: float
+    ) -> Float[Array, " chained"]:
+        """Return the states of the chains some time later, at constant rates."""
+        after = []
+        for chain, rate in zip(self.frame.reference, rates, strict=True):
+            first = reference[len(after)]
+            if len(chain) == 1:
+                after.append(first + rate * time)
+                continue
+            second = reference[len(after) + 1]
+            after.append(first + second * time + 0.5 * rate * time**2)
+            after.append(second + rate * time)
+        return jnp.stack(after)
+
+    def _velocity(self, chained: Float[Array, " chained"]) -> Float[Array, " 2"]:
+        """Return the velocity of a reference with a course, from its chains."""
+        heading = chained[self._course_of[0]]
+        speed = chained[self._course_of[1]]
+        return speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
     def _reference_of(self, inputs: Inputs) -> ReferenceState:
         """Return a reference with this ρ; what ρ does not say is 0."""
@@ -256,7 +311,7 @@ class Tracked:
         first = len(frame.reference)
         entries = [
             inputs[first + ranged.index(state)] if state in ranged else jnp.zeros(())
-            for state in frame.chained
+            for state in frame.followed
         ]
         return jnp.stack(entries)
 

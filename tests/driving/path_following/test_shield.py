@@ -412,13 +412,13 @@ def test_before_anything_is_seen_the_planner_passes_within_the_limits():
         for planned, passed in cases:
             action, after, info = act(jnp.asarray(planned), start, *seen)
             np.testing.assert_allclose(action, passed)
-            assert not bool(after.inner.inner.started | info.claim.holds)
+            assert not bool(after.inner.inner.nominal.started | info.claim.holds)
             unreadable = not np.all(np.isfinite(seen[2]))
             reason = Reason.BAD_REFERENCE if unreadable else Reason.NOT_MEASURED
             assert Reason(int(info.claim.reason)) == reason
             assert np.isnan(float(info.shield.margin))
     _, after, info = act(jnp.asarray([0.1, 0.7]), after, xi, ENV, reference)
-    assert bool(after.inner.inner.started & info.claim.holds)
+    assert bool(after.inner.inner.nominal.started & info.claim.holds)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ is a `Preview`. `along_reference` turns it into one that sees poses in the world
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sfkd_jax.control import (
+    AroundLaw,
+    LawTarget,
     PlanningStart,
     RolloutSetup,
     Sample,
@@ -47,15 +49,13 @@ from sfkd_jax.driving.path_following.tasks._preview import (
     later,
     road_from,
 )
-from sfkd_jax.geometry import entrywise, without_pose
 from sfkd_jax.info import ControllerInfo, PathInfo, Reason, first, reported
 from sfkd_jax.latency import ON_TIME, CommandDelay, delayed, pushed, rows_needed
-from sfkd_jax.rollout import fold
 from sfkd_jax.types import (
-    BODY,
     Control,
     Controller,
     Environment,
+    Fiber,
     Key,
     Params,
     Reference,
@@ -177,20 +177,6 @@ along_reference = factory(AlongReference, AlongReference.controller)
 """(controller along a path, coordinates=size of ξ) -> `Controller` in the world."""
 
 
-class AlongTarget(NamedTuple):
-    """What all samples share of one step.
-
-    Attributes:
-        road: κ [1/m] and v_ref [m/s].
-        turn: of the law on this road.
-        fiber: of the model on this road; None if it is that of all steps.
-    """
-
-    road: Float[Array, "*horizon 2"]
-    turn: SteadyTurn
-    fiber: Any
-
-
 @dataclass(frozen=True, eq=False)
 class FollowingLaw(LawTask):
     """The task of following a path with a model of the closed loop.
@@ -217,6 +203,17 @@ class FollowingLaw(LawTask):
             )
         super().__post_init__()
 
+    @cached_property
+    def _around_law(self) -> AroundLaw:
+        """Rollouts on roads (κ, v_ref)."""
+
+        def turn(road: Float[Array, " 2"], env: Environment) -> SteadyTurn:
+            return self.law.turn(road[0], road[1], env)
+
+        low, high = self.box()
+        perturbation = jnp.asarray(self.law.perturbation)
+        return AroundLaw(self.model, turn, perturbation, low, high, self.limit)
+
     def prepare(
         self,
         params: Params,
@@ -226,54 +223,25 @@ class FollowingLaw(LawTask):
         previous: PlanningStart,
     ) -> RolloutSetup:
         """Return what is evaluated once per control step: fibre, start and targets."""
-        fiber = self.model.fiber(fold(self.model, params), env)
-        turns = jax.vmap(self.law.turn, in_axes=(0, 0, None))(
-            preview.road[:, 0], preview.road[:, 1], env
-        )
-        first_turn = jax.tree.map(lambda leaf: leaf[0], turns)
-        low, high = self.box()
-        law_control = jnp.clip(first_turn.feedback(xi), low, high)
-        # Before the first step no control was applied: slew limits count from the law.
-        before = jnp.where(previous.known, previous.control, law_control)
-        latent = self.model.encode(fiber, without_pose(xi))
-        start = Sample(latent, xi, before)
-        fibers = None
-        if self.model.on_reference is not None:
-            fibers = jax.vmap(partial(self.model.on_reference, fiber))(preview.road)
-        return RolloutSetup(fiber, start, AlongTarget(preview.road, turns, fibers))
+        return self._around_law.prepare(params, xi, env, preview.road, previous)
 
     def step(
         self,
         weights: Any,
-        fiber: Any,
+        fiber: Fiber,
         before: Sample,
         nu: Control,
-        target: AlongTarget,
+        target: LawTarget,
         at: StepIndex,
     ) -> StepResult:
         """Return one step of one rollout: law, perturbation, limits, model."""
-        law_control = target.turn.feedback(before.state)
-        largest = jnp.asarray(self.law.perturbation)
-        nu = entrywise(jnp.clip, nu, -largest, largest)
-        control = self.limit(law_control + nu, before.control)
-        # The model was learned on the perturbations that really acted.
-        effective = control - law_control
-        inputs = jnp.concatenate([effective, target.road])
-        road_fiber = fiber if target.fiber is None else target.fiber
-        latent = self.model.step(road_fiber, before.latent, inputs)
-        xi = self.model.decode(fiber, latent)[BODY]
-        return StepResult(
-            sample=Sample(latent, xi, control),
-            control=control,
-            perturbation=effective,
-            state=xi,
-        )
+        return self._around_law.step(weights, fiber, before, nu, target, at)
 
     def errors(
-        self, before: Sample, after: Sample, target: AlongTarget
+        self, before: Sample, after: Sample, target: LawTarget
     ) -> tuple[PathErrors, PathErrors, Scalar]:
         """Return the errors before and after a step, and the speed of the reference."""
-        speed = target.road[1]
+        speed = target.inputs[1]
 
         def errors_of(xi: PathState) -> PathErrors:
             return PathErrors(xi[LATERAL], xi[HEADING], xi[PATH_SPEED] - speed)

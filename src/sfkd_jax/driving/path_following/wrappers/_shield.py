@@ -2,7 +2,7 @@
 
 Everything that decides whether the planner's control may pass is here. In one control
 step (`Shield.act`) the measurement, which passed the `Gate`, is compared with the
-nominal model (`NominalModel`), the request is scaled down as far as the corridor
+nominal model (`compare`), the request is scaled down as far as the corridor
 needs (`corridor_filter`), and what may be claimed of the step is decided
 (`Shield._claim`).
 """
@@ -17,11 +17,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sfkd_jax.control import FilterResult, Stateful, all_finite
-from sfkd_jax.driving.path_coordinates import HEADING, PATH_FRAME, PATH_SPEED, PathState
+from sfkd_jax.control import (
+    FilterResult,
+    NominalModel,
+    NominalState,
+    Stateful,
+    all_finite,
+)
+from sfkd_jax.driving.path_coordinates import (
+    HEADING,
+    LATERAL,
+    PATH_FRAME,
+    PATH_SPEED,
+    PathState,
+)
 from sfkd_jax.driving.path_following.laws._feedback import holding
 from sfkd_jax.driving.path_following.laws._path_law import PathLaw
 from sfkd_jax.driving.path_following.tasks._preview import Preview
+from sfkd_jax.driving.path_following.wrappers._comparison import (
+    Compared,
+    ShieldState,
+    compare,
+)
 from sfkd_jax.driving.path_following.wrappers._conditions import (
     ANYWHERE,
     Box,
@@ -29,11 +46,6 @@ from sfkd_jax.driving.path_following.wrappers._conditions import (
     check_box,
 )
 from sfkd_jax.driving.path_following.wrappers._corridor_filter import corridor_filter
-from sfkd_jax.driving.path_following.wrappers._nominal import (
-    Comparison,
-    NominalModel,
-    ShieldState,
-)
 from sfkd_jax.driving.path_following.wrappers._rolling import RollingCorridor
 from sfkd_jax.info import Claim, ControllerInfo, Reason, ShieldInfo, first, reported
 from sfkd_jax.ranges import AtLeastOne, Fraction, NonNegative, Positive, check_intervals
@@ -153,11 +165,7 @@ class Shield(Stateful):
         environments = len(self.law.low) - 2
         return ShieldState(
             inner=self.inner.init(key),
-            latent=self._nominal(self.tube).zeros(
-                key, self.law.gain.shape[-1], environments
-            ),
-            started=jnp.asarray(False),
-            env=jnp.full(environments, jnp.nan, dtype=float),
+            nominal=self._nominal.init(key, self.law.gain.shape[-1], environments),
             offset=jnp.zeros(()),
             rolling=jnp.full((), jnp.nan, dtype=float),
         )
@@ -174,18 +182,29 @@ class Shield(Stateful):
         planned, inner, info = self.inner.act(params, state.inner, xi, env, preview)
         tube = self._tube(preview.later)
         road = self._road(preview)
-        turn = self.law.turn(road[0, 0], road[0, 1], self.conditions.nearest(env))
+        inside = self.conditions.nearest(env)
+        turn = self.law.turn(road[0, 0], road[0, 1], inside)
         law_control = turn.feedback(xi)
-        compared = self._nominal(tube).compare(
-            params, state._replace(inner=inner), xi, env, preview, turn
+        compared = compare(
+            self._nominal,
+            params,
+            state,
+            xi,
+            env,
+            preview,
+            turn,
+            conditions=self.conditions,
+            allowed=tube + self.noise_allowance,
+            start_error=self.start_error,
         )
+        nominal = compared.with_vehicle.nominal
+        started = compared.started
         info = reported(info)
         decision = self._decide(
             compared, planned, info.plan.healthy, law_control, xi, road
         )
-        now = compared.state
         reason = self._reason(compared, decision, preview)
-        claim = self._claim(reason, now, xi, preview, tube)
+        claim = self._claim(reason, state.rolling, compared.offset, xi, preview, tube)
         passed = decision.passed
         removed = jnp.where(compared.outside_box, 1.0, 1.0 - passed.scale)
         rolls = claim.reason == Reason.ROLLING
@@ -195,27 +214,40 @@ class Shield(Stateful):
             claim=claim,
             env_inside=compared.env_inside,
             shield=ShieldInfo(
-                margin=jnp.where(now.started, passed.margin, jnp.nan),
-                intervention=jnp.where(now.started & decision.changed, removed, 0.0),
+                margin=jnp.where(started, passed.margin, jnp.nan),
+                intervention=jnp.where(started & decision.changed, removed, 0.0),
                 perturbation=passed.nu,
-                nominal_state=compared.nominal_state,
-                nominal_distance=compared.distance,
+                nominal_state=jnp.where(started, nominal.state, jnp.nan),
+                nominal_distance=compared.with_vehicle.distance[0],
                 rolling=jnp.where(rolls, added, 0.0),
             ),
         )
-        # After a step without the certificate the nominal model starts anew, and so it
-        # does where its latent is not finite, since it would stay so.
-        covered = (reason == Reason.CERTIFIED) | (reason == Reason.INFEASIBLE)
-        running = covered & all_finite(passed.latent)
-        latent = jax.tree.map(partial(jnp.where, running), passed.latent, now.latent)
         growth = self._rolling.growth(xi, road[0], turn.state[HEADING])
-        after = now._replace(
-            latent=latent,
-            started=running,
-            offset=self.decay * now.offset,
+        after = ShieldState(
+            inner=inner,
+            nominal=self._after(compared, passed, inside, reason),
+            offset=self.decay * compared.offset,
             rolling=claim.bound + growth,
         )
         return decision.control, after, info
+
+    @staticmethod
+    def _after(
+        compared: Compared,
+        passed: FilterResult,
+        env: Environment,
+        reason: Int[Array, ""],
+    ) -> NominalState:
+        """Return the nominal model one sampling period later.
+
+        After a step without the certificate it starts anew, and so it does where its
+        latent is not finite, since it would stay so.
+        """
+        covered = (reason == Reason.CERTIFIED) | (reason == Reason.INFEASIBLE)
+        running = covered & all_finite(passed.latent)
+        now = compared.with_vehicle.nominal.latent
+        latent = jax.tree.map(partial(jnp.where, running), passed.latent, now)
+        return NominalState(latent, running, env)
 
     def _tube(self, later: Scalar) -> Scalar:
         """Return the bound for a vehicle that is later by some periods [m].
@@ -229,15 +261,10 @@ class Shield(Stateful):
         least = min(0.0, self.late[0][0]) if self.late else 0.0
         return jnp.where(later < least, jnp.inf, tube)
 
-    def _nominal(self, tube: Scalar | float) -> NominalModel:
-        """Return the model that the shield keeps in its corridor."""
-        return NominalModel(
-            model=self.model,
-            conditions=self.conditions,
-            tube=tube,
-            noise_allowance=self.noise_allowance,
-            start_error=self.start_error,
-        )
+    @property
+    def _nominal(self) -> NominalModel:
+        """The model that the shield keeps in its corridor."""
+        return NominalModel(self.model, ((LATERAL,),))
 
     @property
     def _rolling(self) -> RollingCorridor:
@@ -246,7 +273,7 @@ class Shield(Stateful):
 
     def _decide(
         self,
-        compared: Comparison,
+        compared: Compared,
         planned: Control,
         healthy: Bool[Array, ""] | bool,
         law_control: Control,
@@ -254,7 +281,8 @@ class Shield(Stateful):
         road: Float[Array, "preview 2"],
     ) -> Decision:
         """Return the control to apply: that of the planner as far as it may pass."""
-        now = compared.state
+        started = compared.started
+        nominal = compared.with_vehicle.nominal
         # A plan that goes on with an old one is worse than the law, which sees the car.
         usable = all_finite(planned) & healthy
         planned = self._within_limits(jnp.where(all_finite(planned), planned, 0.0))
@@ -263,8 +291,8 @@ class Shield(Stateful):
         limit = jnp.where(compared.outside_box, 0.0, self.law.perturbation)
         passed = corridor_filter(
             self.model,
-            compared.fiber,
-            now.latent,
+            nominal.fiber,
+            nominal.latent,
             request,
             road,
             limit,
@@ -273,17 +301,17 @@ class Shield(Stateful):
         changed = jnp.any(passed.nu != request)
         # A request that passes is returned bit for bit, not as law + (u − law).
         limited = self._within_limits(law_control + passed.nu)
-        control = jnp.where(now.started & (~usable | changed), limited, planned)
+        control = jnp.where(started & (~usable | changed), limited, planned)
         # Whoever brakes harder than the class has a reason that no certificate knows.
         gentlest = self._within_limits(law_control) - self.law.perturbation
-        braking = usable & now.started & (planned[1] < gentlest[1] - 1e-3)
+        braking = usable & started & (planned[1] < gentlest[1] - 1e-3)
         drive = jnp.where(braking, planned[1], control[1])
-        drive = self._held(now.started, drive, xi[PATH_SPEED], road[0, 1])
+        drive = self._held(started, drive, xi[PATH_SPEED], road[0, 1])
         control = jnp.stack([control[0], drive])
         return Decision(control, usable, passed, changed, braking)
 
     def _reason(
-        self, compared: Comparison, decision: Decision, preview: Preview
+        self, compared: Compared, decision: Decision, preview: Preview
     ) -> Int[Array, ""]:
         """Return what speaks against a claim in this step; CERTIFIED if nothing does.
 
@@ -292,9 +320,9 @@ class Shield(Stateful):
         return first(
             preview.reason,
             (~jnp.all(preview.measured), Reason.NOT_MEASURED),
-            (~compared.state.started, Reason.NOT_STARTED),
+            (~compared.started, Reason.NOT_STARTED),
             (compared.outside_box | ~compared.env_inside, Reason.OUTSIDE_BOX),
-            (compared.bound_exceeded, Reason.BOUND_EXCEEDED),
+            (compared.with_vehicle.exceeded, Reason.BOUND_EXCEEDED),
             (decision.braking, Reason.BRAKING),
             (~decision.passed.feasible, Reason.INFEASIBLE),
         )
@@ -302,7 +330,8 @@ class Shield(Stateful):
     def _claim(
         self,
         reason: Int[Array, ""],
-        before: ShieldState,
+        rolling: Scalar,
+        offset: Scalar,
         xi: PathState,
         preview: Preview,
         tube: Scalar,
@@ -311,7 +340,8 @@ class Shield(Stateful):
 
         Args:
             reason: from `_reason`.
-            before: the nominal model at this step.
+            rolling: bound of |e_y| at this step, whatever steers [m].
+            offset: what the start adds to the bound of |e_y − ê_y| [m].
             xi: measured ξ.
             preview: of the road.
             tube: of a vehicle that is so late [m].
@@ -319,13 +349,13 @@ class Shield(Stateful):
         known = jnp.isfinite(tube) & self.claimed
         reason = first(reason, (~known, Reason.NOT_CALIBRATED))
         holds = reason == Reason.CERTIFIED
-        certified = self.width + tube + before.offset
+        certified = self.width + tube + offset
         measured = (preview.reason == Reason.CERTIFIED) & jnp.all(preview.measured)
         slow = self._rolling.applies(xi, self._road(preview)[0]) & known
-        rolls = slow & measured & ~holds & jnp.isfinite(before.rolling)
+        rolls = slow & measured & ~holds & jnp.isfinite(rolling)
         bound = jnp.where(holds, certified, jnp.nan)
         return Claim(
-            bound=jnp.where(rolls, before.rolling, bound),
+            bound=jnp.where(rolls, rolling, bound),
             reason=jnp.where(rolls, Reason.ROLLING, reason),
         )
 
