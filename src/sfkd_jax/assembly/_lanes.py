@@ -41,6 +41,7 @@ def build_in_lane(
     car: tuple[float, float],
     planner: str,
     friction: int | None,
+    reverse: bool = False,
 ) -> Controller:
     """Return a controller that drives in a lane, see `path_following.InLane`.
 
@@ -53,6 +54,7 @@ def build_in_lane(
         car: length and width [m].
         planner: that searches for a reference, in `PLANNERS`.
         friction: entry of e that is the friction; None if none is.
+        reverse: whether the vehicle reverses where u_2 is below 0 at rest.
     """
     admissible = _admissible_references(plant, law, certificate, car)
     manoeuvres = path_following.Manoeuvres.scaled(admissible, plant.dt)
@@ -69,7 +71,7 @@ def build_in_lane(
     if friction is not None:
         grip["lowest"] = certificate.measured.boxes.env[0][friction]
     speed_gain = float(np.mean(law.gain[..., 1, PATH_SPEED]))
-    return path_following.in_lane(
+    lane = path_following.InLane(
         inner=inner,
         planner=PLANNERS[planner](manoeuvres.task(), **options),
         manoeuvres=manoeuvres,
@@ -80,6 +82,16 @@ def build_in_lane(
         friction=friction,
         **grip,
     )
+    if not reverse:
+        return lane.controller()
+    reversing = path_following.Reversing(
+        lane=lane,
+        wheelbase=plant.wheelbase,
+        low=plant.control_low,
+        high=plant.control_high,
+        speed_loop=plant.speed_loop,
+    )
+    return reversing.controller()
 
 
 def _admissible_references(

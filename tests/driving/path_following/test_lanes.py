@@ -277,21 +277,25 @@ def follower():
     return Controller(lambda key: jnp.zeros(()), act)
 
 
-def lane_with(planner, kind=KIND, **settings):
-    """The controller of a lane, and its step as one program."""
+def settings_with(planner, kind=KIND, **settings):
+    """The settings of a controller in a lane."""
     task = path_following.Manoeuvres.scaled(kind, DT)
     length, speed = kind.scale
     noise = (1.5 * length, 10.0 * length, 1.5 * length, 10.0 * length, speed)
     search = {"horizon": 1, "noise_std": noise, "noise": "white"}
-    search = planner(task.task(), **search, **settings)
-    driver = path_following.in_lane(
+    return path_following.InLane(
         inner=follower(),
-        planner=search,
+        planner=planner(task.task(), **search, **settings),
         manoeuvres=task,
         horizon=20,
         view=100.0 * length,
         spacing=0.5 * length,
     )
+
+
+def lane_with(planner, kind=KIND, **settings):
+    """The controller of a lane, and its step as one program."""
+    driver = settings_with(planner, kind, **settings).controller()
     return driver, jit(driver.act)
 
 
@@ -594,6 +598,92 @@ def test_a_lane_too_narrow_for_the_corridor_stops_and_says_so(
         assert bool(info.lane.admissible) != narrow
         assert info.lane.edge == pytest.approx(room, abs=0.01)
     assert (rows[-1][0][3] == 0.0) == narrow
+
+
+WHEELBASE = 2.7
+
+
+@pytest.fixture(scope="module")
+def reversing():
+    driver = path_following.Reversing(
+        lane=settings_with(control.mppi, num_samples=100, effective_samples=5.0),
+        wheelbase=WHEELBASE,
+        low=(-0.5, -6.0),
+        high=(0.5, 3.0),
+        patience=1.0,
+    ).controller()
+    return driver, jit(driver.act)
+
+
+def backed_up(car, control):
+    """A car without slip after a control step, u_2 is an acceleration."""
+    x, y, yaw, speed = car
+    steering, drive = np.asarray(control, np.float64)
+    after = speed + DT * drive
+    way = 0.5 * DT * (speed + after)
+    turned = way * np.tan(steering) / WHEELBASE
+    x += way * np.cos(yaw + 0.5 * turned)
+    y += way * np.sin(yaw + 0.5 * turned)
+    return np.float32([x, y, yaw + turned, after])
+
+
+def drive_back(reversing, road, posts, steps, car):
+    """A car that is where its reference says, if it neither stands nor backs up."""
+    driver, act = reversing
+    state = driver.init(jax.random.key(1))
+    rows = []
+    env = jnp.asarray([0.9, 0.0])
+    for _ in range(steps):
+        command, state, info = act(None, state, car, env, (road, nine(posts)))
+        rows.append((car, info))
+        ahead = np.asarray(info.lane.reference[0])
+        forwards = ahead if ahead[3] > 0.0 else car
+        car = backed_up(car, command) if info.lane.reversing else forwards
+    return rows
+
+
+def test_a_car_too_near_to_turn_backs_up_along_its_lane_and_drives_round(
+    reversing, straight
+):
+    """It stands 2.5 m before a post, aside and turned, in a lane of 10 m."""
+    wide = straight._replace(left=3.0 * straight.left, right=3.0 * straight.right)
+    post = circles(jnp.asarray([[65.0 + 2.5 + 0.8, 0.2]]), 0.8)
+    start = np.float32([65.0 - KIND.half[0], 0.6, 0.1, 0.0])
+    rows = drive_back(reversing, wide, post, 290, start)
+    back = np.array([bool(info.lane.reversing) for _, info in rows])
+    cars = np.stack([car for car, _ in rows])
+    assert not back[:9].any()
+    # Once, and until it stands.
+    assert np.sum(np.diff(back.astype(int)) == 1) == 1
+    ended = np.flatnonzero(back)[-1] + 1
+    assert -0.3 < cars[ended, 3] <= 0.0
+    assert 3.0 < cars[0, 0] - cars[ended, 0] < 30.0
+    assert cars[ended, 1] == pytest.approx(0.6, abs=0.3)
+    assert abs(cars[ended, 2]) < 0.05
+    assert cars[-1, 0] > 80.0
+    assert min(room(car, post) for car in cars) > KIND.margin
+    for _, info in np.array(rows, object)[back]:
+        assert info.claim.reason == Reason.REVERSING
+        assert np.isnan(info.claim.bound)
+    # The errors of the certified law decay first.
+    assert all(info.claim.reason == Reason.EVADING for _, info in rows[ended:][:18])
+    assert rows[-1][1].claim.holds
+
+
+@pytest.mark.parametrize("where", ["behind", "start", "free"])
+def test_it_does_not_back_up_into_what_is_behind_or_without_need(
+    reversing, straight, where
+):
+    """Something near behind, the start of its path, or nothing that stops it."""
+    along = 3.0 if where == "start" else 65.0
+    posts = circles(jnp.asarray([[along + 4.0, 0.0], [along - 4.0, 0.0]]), 0.8)
+    present = jnp.asarray([where != "free", where == "behind"])
+    posts = posts._replace(present=present)
+    rows = drive_back(
+        reversing, straight, posts, 40, np.float32([along, 0.0, 0.0, 0.0])
+    )
+    assert not any(info.lane.reversing for _, info in rows)
+    assert (rows[-1][0][0] > along + 1.0) == (where == "free")
 
 
 @pytest.mark.parametrize("attack", ["inside", "nan", "edge"])

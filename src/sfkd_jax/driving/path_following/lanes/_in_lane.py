@@ -221,6 +221,8 @@ class InLane(Stateful):
                 admissible=judged.violation <= 0.0,
                 stopping=~judged.curve.reached[-1],
                 evading=evading,
+                waiting=jnp.any(~judged.curve.reached & (situation.road.wanted > 0.0)),
+                reversing=jnp.asarray(False),
             ),
         )
         wait = jnp.where(due, self.period, state.wait) - 1
@@ -300,6 +302,8 @@ class InLane(Stateful):
             behind = progress < start - 0.5 * path.length
             index = index - jnp.where(behind, gaps, 0)
         first = jnp.floor(progress / distance).astype(int) - BEHIND
+        # A reference that stands behind a car that rolled back would stand for ever.
+        fresh |= known & (first < index) & (square[BEHIND] <= 0.0)
         first = jnp.where(fresh, first, jnp.maximum(first, index))
         accelerations = (limits.acceleration, limits.deceleration)
         road = road_ahead(lane, first, self.samples, accelerations, self.spacing)
