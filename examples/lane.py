@@ -20,6 +20,7 @@ import sfkd_jax
 from sfkd_jax import assembly
 from sfkd_jax.driving import scenarios, simulation
 from sfkd_jax.report import film as films
+from sfkd_jax.report.lane_film import LaneFilm
 
 SECONDS = 60.0
 ROAD = {
@@ -113,7 +114,7 @@ def main(runs=1, seed=0, vehicle="dynamic", film="lane.gif"):
 
     scene = replace_obstacles(draw_scene(keys[0]), OBSTACLES_OF_THE_FILM)
     episode = drive(scene, keys[0])
-    picture = films.LaneFilm(scene, episode, dt=plant.dt, car=plant.size.half)
+    picture = LaneFilm(scene, episode, dt=plant.dt, car=plant.size.half)
     films.write(Path(film), picture)
 
     summary = summarise(stacked, policy.certificate.corridor.corridor_m)

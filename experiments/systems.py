@@ -22,7 +22,8 @@ import numpy as np
 from benchmarks import as_lines, stamp
 from sfkd_jax.certification import CertificationRefused
 from sfkd_jax.experiment.system_runs import (
-    compare_system,
+    compared,
+    drive_beside_rivals,
     random_scenes,
     run_controller,
 )
@@ -41,7 +42,7 @@ SMALL = {"steps": 500, "segments": 0.3, "runs": 60, "duration": 10.0}
 """Settings of `certify_system` in small size; in full size they are its defaults."""
 SMALL_SYSTEMS = "quadrotor", "cart_pole"
 SMALL_COMPARISON = {"runs": 4, "duration": 10.0}
-"""Settings of `compare_system` in small size."""
+"""Settings of `drive_beside_rivals` in small size."""
 DIGITS = 4
 """Significant digits of the numbers of a line."""
 
@@ -93,7 +94,7 @@ def line_of(name, directory, *, settings, comparison):
         name: of the example.
         directory: of the run.
         settings: of `certify_system`.
-        comparison: settings of `compare_system`.
+        comparison: settings of `drive_beside_rivals`.
     """
     began = time.perf_counter()
     example = runpy.run_path(str(EXAMPLES / f"{name}.py"))
@@ -121,7 +122,7 @@ def line_of(name, directory, *, settings, comparison):
         "unit": {output: units[output] for output in tubes.outputs},
         "coverage": tubes.coverage.share,
         "coverage_ci95": tubes.coverage.ci95,
-        **compare_system(policy, system, **comparison),
+        **compared(drive_beside_rivals(policy, system, **comparison)),
         **back,
         # Of the certificate, if it was not interrupted.
         "minutes": minutes,

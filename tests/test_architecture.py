@@ -79,10 +79,11 @@ APPLICATIONS = {
     "export": ROAD
     | {"assembly", "policy", "settings", "store"}
     | {"certificate", "driving.certificate", "driving.path_following"},
-    "adapters": PLANT | {"assembly"},
+    "adapters": PLANT | {"assembly", "policy", "systems"},
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}
-    | {"certificate", "driving.certificate"},
+    | {"certificate", "driving.certificate"}
+    | {"policy", "settings", "systems"},
     "__init__": {"export", "geometry", "info", "latency", "policy", "store", "systems"},
 }
 """What puts the floors together."""

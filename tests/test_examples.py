@@ -81,24 +81,6 @@ def test_logged_runs_become_a_certified_model_that_plans(monkeypatch):
     assert abs(result["first_control"]) <= 1.0
 
 
-@pytest.mark.exhaustive
-def test_the_brax_pendulum_is_learned_certified_and_driven(monkeypatch):
-    """In two seconds a pole left alone lies. So short a training gives a certificate,
-    not yet a good driver.
-    """
-    sizes = {"runs": 50, "steps": 50, "samples": 64, "horizon": 20, "seconds": 2.0}
-    result = example("brax_pendulum", monkeypatch)["main"](**sizes)
-    proof = result["proof"]
-    rows = result["rows"]
-    assert proof.attacks["step_slopes"] <= proof.alpha < 1.0
-    assert len(result["measured"].tube.latent) == 20
-    assert np.isfinite(rows["SFKD"]["rms_m"])
-    # e is 1 for the first three seconds.
-    assert rows["SFKD"] == rows["SFKD, given e = 1"]
-    assert not rows["true dynamics"]["fallen"]
-    assert rows["true dynamics"]["rms_m"] < rows["gain alone"]["rms_m"]
-
-
 # ---- ROS 2, against a stub of it
 
 

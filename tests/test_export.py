@@ -350,7 +350,7 @@ def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
         ("controller.json", lambda x: b'{"kind": "policy"}', "not the manifest"),
         (
             "controller.json",
-            lambda x: x.replace(b'"format": 2', b'"format": 1'),
+            lambda x: x.replace(b'"format": 3', b'"format": 1'),
             "format 1",
         ),
         (

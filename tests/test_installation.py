@@ -1,12 +1,15 @@
 """A wheel without the extras loads a policy: the packages of `train` are not needed."""
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PROGRAM = """
@@ -76,3 +79,25 @@ def test_a_policy_acts_and_a_command_says_what_it_lacks(unpacked):
     )
     line = 'sfkd_jax: this needs hydra: pip install "sfkd-jax[train]"'
     assert done.stdout.splitlines() == 3 * [line], done
+
+
+def test_the_lock_pins_the_tested_versions_by_hashes_and_names_no_host():
+    lock = (ROOT / "requirements.lock").read_text("utf-8")
+    tested = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+    assert "://" not in lock
+    # A requirement and its hashes, over several lines.
+    locked = re.split(r"\n(?=\S)", lock.strip())
+    assert [entry.split(" \\\n")[0] for entry in locked] == tested
+    for entry in locked:
+        digests = re.findall(r"--hash=sha256:([0-9a-f]+)", entry)
+        assert digests
+        assert all(len(digest) == 64 for digest in digests)
+
+
+def test_the_lock_has_what_the_package_needs():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    needed = project["dependencies"] + project["optional-dependencies"]["train"]
+    lock = (ROOT / "requirements.lock").read_text("utf-8")
+    pinned = dict(re.findall(r"^([\w.-]+)==([\w.]+)", lock, re.MULTILINE))
+    for requirement in map(Requirement, needed):
+        assert pinned[requirement.name] in requirement.specifier

@@ -41,6 +41,10 @@ MAKERS = {
         "benchmarks/adaptation_run.json",
         adaptation_figure.draw,
     ),
+    "drone.gif": Maker(
+        "python -m experiments.drone runs/systems/quadrotor --write",
+        "experiments/drone.json",
+    ),
     "figures/figure1.png": Maker(
         "python -m experiments.paper_figures",
         "experiments/figure1.json",

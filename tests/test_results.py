@@ -44,6 +44,22 @@ def test_the_systems_in_their_file_are_among_the_examples():
     assert set(names) <= set(systems.SYSTEMS)
 
 
+def test_what_the_page_of_systems_says_of_the_drone():
+    page = (results.HOME.parent / "docs" / "your-system.md").read_text("utf-8")
+    words = " ".join(page.split())
+    flown = pages.read("experiments/drone.json")
+    own = flown["policy"]
+    assert own["collisions"] == own["beyond"] == 0
+    assert own["claimed"] == 1.0
+    for said in (
+        f"the certified bound of {flown['bound_m']:.3f} m",
+        f"In {flown['flights']} flights through {flown['windows']} windows",
+        f"errors was {own['largest_error_m']:.3f} m",
+        f"up to {flown['nominal']['largest_error_m']:.3f} m off",
+    ):
+        assert said in words
+
+
 @pytest.mark.parametrize("name", results.BENCHMARKS)
 def test_a_file_has_a_line_a_row_and_every_row_its_episodes(name):
     text = (results.HOME / f"{name}.json").read_text("utf-8")

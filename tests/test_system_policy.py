@@ -1,9 +1,13 @@
-"""A system from its equations to a certified policy, and every way to spoil it."""
+"""A system from its equations to a certified policy, every way to spoil it, and its uses."""
 
 import json
 import shutil
+import subprocess
+import sys
 from functools import partial
 
+import composing
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +18,16 @@ from loops import DT, FASTEST, LIMIT, frame, loop, mass, pushed, tracked
 
 import sfkd_jax
 from experiments.systems import share_back
+from sfkd_jax import export
+from sfkd_jax.adapters import GymnasiumShield
+from sfkd_jax.experiment.system_runs import compared, drive_beside_rivals, first_run
 from sfkd_jax.experiment.systems import certify_system
+from sfkd_jax.export import __main__ as exporting
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.policy import SystemPolicy, is_system, restore_system, save_system
+from sfkd_jax.report.system import COMPARISON, FIRST_RUN, write_system_report
 from sfkd_jax.schedules import random_switching
+from sfkd_jax.store import ArtefactError
 from sfkd_jax.systems import ClosedLoop, random_reference, spread_of
 from sfkd_jax.tubes import measure_tubes
 from sfkd_jax.types import Controller
@@ -373,3 +383,139 @@ def test_the_law_of_a_file_is_that_of_the_run(certified):
     for mine, stored in zip(loop().law, law, strict=True):
         np.testing.assert_allclose(mine, stored, rtol=1e-4, atol=1e-5)
     assert float(jnp.max(jnp.abs(law.low - jnp.asarray([-FASTEST, 0.8, -0.5])))) < 1e-6
+
+
+SCRIPT = """
+import sys, json, numpy as np
+from run_controller import ExportedController
+
+controller = ExportedController(".")
+state = controller.init(seed=0)
+found = []
+for given in zip(*json.loads(sys.stdin.read())):
+    u, state, info = controller.act(state, *(np.asarray(a, float) for a in given))
+    found.append([*u.tolist(), *np.atleast_1d(info.claim.bound).tolist()])
+assert "sfkd_jax" not in sys.modules
+print(json.dumps(found))
+"""
+"""Steps an export with the inputs from stdin."""
+
+
+def inputs(steps=4):
+    """Of a few steps: states, e, and a reference that stands still."""
+    rng = np.random.default_rng(1)
+    states = rng.normal(size=(steps, 2)).astype(np.float32) * 0.01
+    envs = np.asarray([[1.0, 0.2]] * steps, np.float32)
+    return states, envs, np.zeros((steps, SETTINGS["horizon"] + 1, 2), np.float32)
+
+
+def test_an_export_repeats_every_step_in_a_process_without_this_package(certified):
+    root, policy = certified
+    run = composing.run(f"root={root.parent}", "name=mass", "system=nowhere:make")
+    written = exporting.main(run)
+    folder = root / "export"
+    assert written["policy"] == str(folder / "system.safetensors")
+    given = json.dumps([values.tolist() for values in inputs()])
+    result = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        input=given,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    state = policy.controller.init(jax.random.key(0))
+    act = jax.jit(policy.controller.act)
+    expected = []
+    for x, e, r in zip(*inputs(), strict=True):
+        u, state, info = act(policy.params, state, x, e, r)
+        expected.append([*np.asarray(u), *np.atleast_1d(info.claim.bound)])
+    np.testing.assert_allclose(json.loads(result.stdout), expected, atol=1e-5)
+    # It steps itself too, and is read like the run.
+    stepped = subprocess.run(
+        [sys.executable, "run_controller.py", "--steps", "2"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(stepped.stdout)["names"] == ["force [N]"]
+    again = sfkd_jax.load(folder)
+    assert again.certificate.tubes == policy.certificate.tubes
+    with pytest.raises(ValueError, match=r"export.lane is for vehicles"):
+        export.write_controller(policy, folder, lane=(10, 1, 1))
+
+
+def test_the_page_says_what_the_certificate_says(certified):
+    root, policy = certified
+    page = root / "report" / "index.html"
+    write_system_report(root)
+    assert "comparison.json is missing" in page.read_text("utf-8")
+    driven = drive_beside_rivals(policy, mass(), runs=2, duration=3.0)
+    (root / COMPARISON).write_text(json.dumps(compared(driven)), "utf-8")
+    (root / FIRST_RUN).write_text(json.dumps(first_run(policy, driven)), "utf-8")
+    pages = write_system_report(root)
+    text = page.read_text("utf-8")
+    bounds = policy.certificate.tubes.outputs["position"]
+    for shown in (
+        f"{bounds.total:.3g}",
+        f"{bounds.tube:.3g}",
+        f"{policy.certificate.proof.alpha:.4f}",
+        "position [m]",
+        "e: mass [kg]",
+        "reference: rate of v",
+    ):
+        assert shown in text, shown
+    assert any("first_run" in picture for picture in pages["figures"])
+    with pytest.raises(ArtefactError, match=r"train system=… makes a run"):
+        write_system_report(root.parent)
+
+
+class MassEnv(gymnasium.Env):
+    """The mass as an environment of gymnasium, whose actions are shares of the force."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = np.zeros(2)
+        return self.x, {}
+
+    def step(self, action):
+        env = jnp.asarray([1.0, 0.3])
+        self.x = np.asarray(pushed(self.x, self.control(action), env))
+        return self.x, 0.0, False, False, {}
+
+    def situation(self):
+        return self.x, np.asarray([1.0, 0.3]), np.zeros((SETTINGS["horizon"] + 1, 2))
+
+    def control(self, action):
+        return LIMIT * np.asarray(action)
+
+    def action(self, control):
+        return np.asarray(control) / LIMIT
+
+
+def test_random_actions_stay_within_the_bounds_behind_the_shield(certified):
+    _, policy = certified
+    env = GymnasiumShield(MassEnv(), policy)
+    unshielded = MassEnv()
+    env.reset(seed=0)
+    unshielded.reset(seed=0)
+    rng = np.random.default_rng(0)
+    total = policy.certificate.tubes.outputs["position"].total
+    farthest = 0.0
+    claims = []
+    for _ in range(round(8.0 / DT)):
+        action = rng.choice([-1.0, 1.0], p=[0.4, 0.6], size=1)
+        state, _, _, _, info = env.step(action)
+        unshielded.step(action)
+        claims.append(info["reason"] == Reason.CERTIFIED)
+        if claims[-1]:
+            assert abs(state[0]) <= info["claim"][0] == pytest.approx(total)
+        assert abs(state[0]) <= 3.0 * total
+        farthest = max(farthest, info["intervention"])
+    assert np.mean(claims) > 0.5
+    assert farthest > 0.5
+    assert abs(unshielded.x[0]) > 10.0 * total

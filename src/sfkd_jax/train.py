@@ -24,7 +24,7 @@ def main(run: Run) -> dict[str, Any]:
     needs it.
     """
     if run.settings.system is not None:
-        return train_system(run.settings)
+        return train_system(run)
     began = time.perf_counter()
     stages.check_settings(run)
     with store.locked(run.directory):

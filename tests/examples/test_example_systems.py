@@ -25,8 +25,8 @@ def check(tracked, key):
     tracked.check_invariance(key)
 
 
-def test_there_are_six_systems_that_are_no_cars():
-    assert len(EXAMPLES) == 6
+def test_there_are_systems_of_our_own_and_of_two_simulators():
+    assert len(EXAMPLES) == 8
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)

@@ -19,7 +19,8 @@ from sfkd_jax.driving.simulation import Episode
 from sfkd_jax.driving.simulation.metrics import METRICS, Metric
 from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
-from sfkd_jax.report.film import Film, LaneFilm, film_of
+from sfkd_jax.report.film import Film, film_of
+from sfkd_jax.report.lane_film import LaneFilm
 from sfkd_jax.report.pages import to_latex
 from sfkd_jax.report.run import write_report, write_results_page
 from sfkd_jax.store import ArtefactError

@@ -47,7 +47,7 @@ def make():
     states = {"shoulder [rad]": 0.0002, "elbow [rad]": 0.0002}  # of the sensors
     states |= {"turn [rad/s]": 0.002, "bend [rad/s]": 0.002}
     system = System(
-        integrated(rates, dt=DT, substeps=2),
+        integrated(rates, dt=DT, substeps=8),
         dt=DT,
         states=states,
         controls={"shoulder [N m]": (-150.0, 150.0), "elbow [N m]": (-80.0, 80.0)},

@@ -24,7 +24,8 @@ class FilterResult(NamedTuple):
     Attributes:
         nu: the perturbation of the law to apply, (control,).
         latent: of the nominal model one step later.
-        scale: s, of the request clipped to its limit; 0 for a backup.
+        scale: smallest share of an entry of the request that passes: s, or less where
+            the limit clips the request; 0 for a backup.
         margin: smallest width − max |ŷ| of an output over the predicted steps, in its
             unit; −inf if not finite.
         feasible: whether the margin is at least 0.
@@ -77,7 +78,10 @@ def safety_filter(
 
     Source: Wabersich and Zeilinger (2021), Automatica 129, 109597.
     """
-    clipped = jnp.clip(jnp.where(all_finite(request), request, 0.0), -limit, limit)
+    finite = jnp.where(all_finite(request), request, 0.0)
+    clipped = jnp.clip(finite, -limit, limit)
+    size = jnp.abs(finite)
+    share = jnp.min(jnp.where(size > limit, limit / size, 1.0))
     # The candidates are the request at every scale and, with scale 0, the backups. The
     # law alone is the last of the scaled requests.
     zeros = (0.0,) * len(backups)
@@ -114,7 +118,7 @@ def safety_filter(
     return FilterResult(
         nu=candidates[chosen],
         latent=jax.tree.map(lambda leaf: leaf[chosen], first),
-        scale=scales[chosen],
+        scale=share * scales[chosen],
         margin=margins[chosen],
         feasible=margins[chosen] >= 0.0,
     )

@@ -65,7 +65,7 @@ def hydra_command(
         try:
             settings = named_for_controller(settings_of(composed, _typed()))
             if settings.system is not None and not of_systems:
-                raise ValueError("system=… is for sfkd_jax.train, which does all of it")
+                raise ValueError("system=… is for train, report and export alone")
             if derived := summary(settings):
                 print_message(derived)
             if sweeping:

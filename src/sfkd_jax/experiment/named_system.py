@@ -4,31 +4,33 @@ from __future__ import annotations
 
 import inspect
 import time
-from pathlib import Path
 from typing import Any
 
 from sfkd_jax import store
-from sfkd_jax.experiment.options import Settings
-from sfkd_jax.experiment.system_runs import compare_system
+from sfkd_jax.experiment.run import Run
+from sfkd_jax.experiment.system_runs import compared, drive_beside_rivals, first_run
 from sfkd_jax.experiment.systems import certify_system
 from sfkd_jax.ranges import imported
+from sfkd_jax.report.system import COMPARISON, FIRST_RUN, write_system_report
 from sfkd_jax.systems import System, Tracking
 
 COMPARED = 8
 """Number of runs in which controllers are compared."""
 
 
-def train_system(settings: Settings) -> dict[str, Any]:
-    """Certify the system that the settings of a command name, and compare it.
+def train_system(run: Run) -> dict[str, Any]:
+    """Certify the system that the settings of a command name, compare it, and report.
 
     Args:
-        settings: of the command; `system` is package.module:function, which returns a
-            `System` and a `Tracking`.
+        run: of the command; `settings.system` is package.module:function, and returns
+            a `System` and a `Tracking`.
 
     Raises:
         ValueError: the function does not return these.
     """
     began = time.perf_counter()
+    settings = run.settings
+    directory = run.directory
     make = imported(str(settings.system), "system")
     if not callable(make) or inspect.signature(make).parameters:
         raise ValueError(f"system={settings.system} must be a function of no arguments")
@@ -40,12 +42,11 @@ def train_system(settings: Settings) -> dict[str, Any]:
             f"sfkd_jax.tracking returns it; got {type(made).__name__}"
         )
     system, frame = made
-    directory = Path(settings.root) / settings.name
     certified = certify_system(
         system, frame, root=directory, seed=settings.seed, **vars(settings.tubes)
     )
     store.print_message(str(certified))
-    compared = compare_system(certified, system, runs=COMPARED)
+    driven = drive_beside_rivals(certified, system, runs=COMPARED)
     tubes = certified.certificate.tubes
     result = {
         "run": str(directory),
@@ -55,8 +56,11 @@ def train_system(settings: Settings) -> dict[str, Any]:
         "outputs": {name: vars(bounds) for name, bounds in tubes.outputs.items()},
         "coverage": tubes.coverage.share,
         "coverage_ci95": list(tubes.coverage.ci95),
-        **compared,
+        **compared(driven),
         "seconds": time.perf_counter() - began,
     }
-    store.write_json(directory / "comparison.json", result)
-    return result
+    store.write_json(directory / COMPARISON, result)
+    store.write_json(directory / FIRST_RUN, first_run(certified, driven))
+    page = write_system_report(directory)
+    store.print_message(f"report: {page['report']}")
+    return {**result, **page}

@@ -53,8 +53,10 @@ class Run:
 
     @property
     def directory(self) -> Path:
-        """The directory of the run, root/name/system/seed=N."""
+        """The directory of the run, root/name/system/seed=N; of `system` root/name."""
         settings = self.settings
+        if settings.system is not None:
+            return Path(settings.root) / settings.name
         folder = Path(settings.root) / settings.name / settings.model.system
         return folder / f"seed={settings.seed}"
 

@@ -19,6 +19,9 @@ from sfkd_jax.schedules import random_switching
 from sfkd_jax.systems import ClosedLoop, Following, System, Tracked, random_reference
 from sfkd_jax.types import Control, Controller, Environment, Key, Params, State
 
+POLICY = "policy"
+"""Name of a policy beside its rivals."""
+
 
 class Scene(NamedTuple):
     """What a run is driven through.
@@ -42,10 +45,12 @@ class SystemRuns(NamedTuple):
     Attributes:
         errors: |y| of each output, (run, time, output).
         bounds: what was claimed of it; NaN without a claim.
+        states: of the system, in which the controls were applied.
     """
 
     errors: Float[Array, "run time output"]
     bounds: Float[Array, "run time output"]
+    states: Float[Array, "run time state"]
 
     @property
     def claimed(self) -> Bool[np.ndarray, "run time"]:
@@ -124,7 +129,7 @@ def run_controller(
     rows = list(tracked.rows.values())
 
     def run(params: Params, scene: Scene, key: Key) -> SystemRuns:
-        def advance(carry: Any, at: Any) -> tuple[Any, tuple[Array, Array]]:
+        def advance(carry: Any, at: Any) -> tuple[Any, tuple[Array, ...]]:
             state, inner = carry
             index, env, noise = at
             window = jax.lax.dynamic_slice_in_dim(
@@ -136,7 +141,7 @@ def run_controller(
             error = tracked.coordinates(state, window[0])
             errors = jnp.stack([size_of(error, entries) for entries in rows])
             bounds = jnp.broadcast_to(jnp.asarray(info.claim.bound), errors.shape)
-            return (step(state, control, env), inner), (errors, bounds)
+            return (step(state, control, env), inner), (errors, bounds, state)
 
         steps = jnp.arange(len(scene.envs))
         carry = (scene.start, controller.init(key))
@@ -147,19 +152,15 @@ def run_controller(
     return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))(params, scenes, keys)
 
 
-def compare_system(
+def drive_beside_rivals(
     policy: SystemPolicy,
     system: System,
     *,
     runs: AtLeastOne = 16,
     duration: Positive = 30.0,
     seed: int = 1,
-) -> dict[str, Any]:
-    """Return how a policy drives its system, beside three other controllers.
-
-    All meet the same scenes. "law" is the law alone. "oracle" is the planner of the
-    policy with the true closed loop in place of the model. "nominal" is the same with e
-    in the middle of its box, for law and model alike.
+) -> dict[str, SystemRuns]:
+    """Return runs of a policy and of its `rivals` in the same scenes, by name.
 
     Args:
         policy: of the system.
@@ -168,29 +169,65 @@ def compare_system(
         duration: of each [s].
         seed: of the scenes.
     """
-    tracked = Tracked(system, policy.loop.tracked.frame)
-    loop = ClosedLoop(tracked, policy.loop.law)
     scene_key, drive_key = jax.random.split(jax.random.key(seed))
     scenes = random_scenes(policy, scene_key, runs=runs, duration=duration)
-    true_loop = physics(loop.step, frame=policy.model.frame)
-    oracle = Following(
-        inner=planner_of(policy, true_loop), tracked=tracked
-    ).controller()
     drive = partial(run_controller, policy, system.step, scenes=scenes, key=drive_key)
-    own = drive(controller=policy.controller, params=policy.params)
-    others = {
-        "law": _law_alone(loop),
-        "oracle": oracle,
-        "nominal": _in_usual_env(oracle, system),
-    }
+    driven = {POLICY: drive(controller=policy.controller, params=policy.params)}
+    for name, controller in rivals(policy, system).items():
+        driven[name] = drive(controller=controller, params={})
+    return driven
+
+
+def compared(driven: dict[str, SystemRuns]) -> dict[str, Any]:
+    """Return the RMSE of every controller, and how the claims of the policy held.
+
+    Args:
+        driven: of `drive_beside_rivals`.
+    """
+    own = driven[POLICY]
     result: dict[str, Any] = {
         "rmse": own.rmse(),
         "beyond": own.beyond,
         "claimed": float(own.claimed.mean()),
     }
-    for name, controller in others.items():
-        result[f"rmse_{name}"] = drive(controller=controller, params={}).rmse()
+    for name, runs in driven.items():
+        if name != POLICY:
+            result[f"rmse_{name}"] = runs.rmse()
     return result
+
+
+def first_run(policy: SystemPolicy, driven: dict[str, SystemRuns]) -> dict[str, Any]:
+    """Return |y| at every step of the first run, by controller and output."""
+    return {
+        name: {
+            output: [round(float(error), 7) for error in runs.errors[0, :, index]]
+            for index, output in enumerate(policy.outputs)
+        }
+        for name, runs in driven.items()
+    }
+
+
+def rivals(policy: SystemPolicy, system: System) -> dict[str, Controller]:
+    """Return controllers without a shield, to compare a policy with.
+
+    "law" is the law of the policy alone. "oracle" is its planner with the true closed
+    loop in place of the model. "nominal" is the same with e in the middle of its box,
+    for law and model alike.
+
+    Args:
+        policy: of the system.
+        system: with its step.
+    """
+    tracked = Tracked(system, policy.loop.tracked.frame)
+    loop = ClosedLoop(tracked, policy.loop.law)
+    true_loop = physics(loop.step, frame=policy.model.frame)
+    planner = planner_of(policy, true_loop)
+    oracle = Following(inner=planner, tracked=tracked).controller()
+    return {
+        "law": _law_alone(loop),
+        "oracle": oracle,
+        "nominal": _in_usual_env(oracle, system),
+    }
 
 
 def _law_alone(loop: ClosedLoop) -> Controller:

@@ -15,24 +15,16 @@ def main(run: Run) -> dict[str, Any]:
     """Export the policy of the run; nothing is trained or certified."""
     settings = run.settings
     run_dir = run.directory
-    if not run.policy_path.is_file():
+    is_system = settings.system is not None
+    file = policy.system_file(run_dir) if is_system else run.policy_path
+    if not file.is_file():
         raise store.ArtefactError(
             f"{run_dir} holds no trained controller; "
             "run train with the same options first"
         )
     folder = run_dir / "export"
     with store.locked(run_dir):
-        run.claim()
-        # The weights of the run, the controller of this command.
-        loaded = policy.load(
-            run_dir,
-            controller=store.plain(settings.controller),
-            env_source=settings.environment.source,
-            # None: that of the certificate.
-            latency=None if run.latency.is_none else run.latency,
-        )
-        # With settings of a controller, the policy of a system is refused.
-        trained = cast(policy.Policy, loaded)
+        trained = policy.load_system(run_dir) if is_system else _of_vehicle(run)
         # Not refused: a controller without a certificate drives as well.
         if trained.certificate is None:
             store.print_message("exported without a certificate")
@@ -45,9 +37,23 @@ def main(run: Run) -> dict[str, Any]:
     return {
         "blob": str(folder / "controller.stablehlo"),
         "manifest": str(folder / "controller.json"),
-        "policy": str(folder / "policy.safetensors"),
+        "policy": str(folder / file.name),
     }
 
 
+def _of_vehicle(run: Run) -> policy.Policy:
+    """Return the weights of a run with the controller of this command."""
+    run.claim()
+    loaded = policy.load(
+        run.directory,
+        controller=store.plain(run.settings.controller),
+        env_source=run.settings.environment.source,
+        # None: that of the certificate.
+        latency=None if run.latency.is_none else run.latency,
+    )
+    # With settings of a controller, the policy of a system is refused.
+    return cast(policy.Policy, loaded)
+
+
 if __name__ == "__main__":
-    hydra_command(main)()
+    hydra_command(main, of_systems=True)()

@@ -2,7 +2,7 @@
 
     python run_controller.py --steps 20
 
-checks the files and steps the controller on a straight road. In your own program:
+checks the files and steps the controller in one place. In your own program:
 
     from run_controller import ExportedController
 
@@ -31,12 +31,10 @@ import jax
 import jax.export
 import numpy as np
 
-FORMAT = 2
+FORMAT = 3
 """Version of controller.json that this file reads."""
 CELL = 2048.0
 """Spacing of the origins that positions are made relative to [m]."""
-PLACES = ("observation", "reference", "road", "position")
-"""Inputs that begin with x and y [m]."""
 MALFORMED = (
     KeyError,
     TypeError,
@@ -101,19 +99,21 @@ class ExportedController:
 
         Args:
             state: from `init` or the previous step.
-            observation: (p_x [m], p_y [m], yaw [rad], v [m/s], …).
-            env: (friction [-], lateral wind [m/s]).
-            reference: (horizon, 4): x, y, yaw, speed at the next steps; in a lane a
-                dict of all other inputs that the manifest lists.
+            observation: the states that the manifest names, of a vehicle
+                (p_x [m], p_y [m], yaw [rad], v [m/s], …).
+            env: what the manifest names, such as (friction [-], lateral wind [m/s]).
+            reference: of a vehicle (horizon, 4): x, y, yaw, speed at the next steps; in
+                a lane a dict of all other inputs that the manifest lists. Of a system
+                (horizon + 1, states): now and at the next steps.
             elapsed: sampling periods since the last call; None for one.
         """
         expected = self.manifest["programs"]["act"]["inputs"]
         inputs = self._inputs(expected, state, observation, env, reference)
         names = [name for name in inputs if not name.startswith("state.")]
         origin = np.zeros(2)
-        places = [name for name in names if name in PLACES]
+        places = self.manifest["places"]
         # As `sfkd_jax.relative`: before the cast, and never of what was float32 before.
-        if min(inputs[name].dtype.itemsize for name in places) == 8:
+        if places and min(inputs[name].dtype.itemsize for name in places) == 8:
             # The first point of what is ahead: the road, or the reference.
             first_point = inputs[names[2]][0, :2]
             first_point = np.nan_to_num(first_point, posinf=0.0, neginf=0.0)
@@ -257,23 +257,24 @@ def _content(path: Path) -> bytes:
 
 
 def main() -> None:
-    """Step the controller beside a straight road and print its controls."""
+    """Step the controller in one place and print its controls."""
     parser = argparse.ArgumentParser(
-        description="Check an exported controller and step it on a straight road."
+        description="Check an exported controller and step it in one place."
     )
     parser.add_argument("folder", nargs="?", default=Path(__file__).parent, type=Path)
     parser.add_argument("--steps", default=10, type=int)
     arguments = parser.parse_args()
     try:
         controller = ExportedController(arguments.folder)
-        measured = _straight(controller.manifest)
-        names = [entry["name"] for entry in controller.manifest["controls"]]
+        manifest = controller.manifest
+        measured = _in_place(manifest) if "place" in manifest else _straight(manifest)
+        names = [entry["name"] for entry in manifest["controls"]]
     except (ExportError, *MALFORMED) as reason:
         sys.exit(f"run_controller: {type(reason).__name__}: {reason}")
     state = controller.init()
     controls = []
     times = []
-    # The car stands still: what is checked is the program, not the driving.
+    # Nothing moves: what is checked is the program, not the driving.
     for _ in range(arguments.steps):
         began = time.perf_counter()
         control, state, _ = controller.act(state, *measured)
@@ -285,6 +286,18 @@ def main() -> None:
         "median_ms": float(np.median(times)),
     }
     print(json.dumps(result))
+
+
+def _in_place(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the inputs of a system at a reference that does not move."""
+    place = manifest["place"]
+    box = manifest["environment"]
+    rows = manifest["horizon"] + 1
+    return (
+        np.asarray(place["observation"], np.float32),
+        np.mean([box["low"], box["high"]], axis=0),
+        np.tile(np.asarray(place["reference"], np.float32), (rows, 1)),
+    )
 
 
 def _straight(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, Any]:

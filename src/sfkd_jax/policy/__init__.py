@@ -21,11 +21,14 @@ from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.policy._calling import entrance, with_capacity
 from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
 from sfkd_jax.policy._certificate import RECORDED as RECORDED
+from sfkd_jax.policy._certificate import SavedHashes, save_certificate
 from sfkd_jax.policy._certificate import read_certificate as read_certificate
 from sfkd_jax.policy._description import describe, interface_of
+from sfkd_jax.policy._shipped import POLICY_FILE
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
 from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
 from sfkd_jax.policy._shipped import policies as policies
+from sfkd_jax.policy._system_policy import SYSTEM_KIND as SYSTEM_KIND
 from sfkd_jax.policy._system_policy import SystemPolicy as SystemPolicy
 from sfkd_jax.policy._system_policy import TrainedSystem as TrainedSystem
 from sfkd_jax.policy._system_policy import describe_system as describe_system
@@ -169,6 +172,17 @@ class Policy(TrainedModel):
     def weights(self) -> Params:
         """The learned parameters as they were saved, to train on or to save again."""
         return unfold(self.params)
+
+    @property
+    def reference_shape(self) -> tuple[int, int]:
+        """Shape of the reference that `act` takes: a row at each of the next steps."""
+        return self.interface["horizon"], len(self.interface["reference"])
+
+    def save(self, folder: Path) -> SavedHashes:
+        """Write the policy and its certificate, for `load`."""
+        path = folder / POLICY_FILE
+        manifest = save(path, self.weights, self.settings, law=self.law)
+        return save_certificate(folder, manifest, self.certificate)
 
 
 if TYPE_CHECKING:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
 from sfkd_jax import certificate as certificates
 from sfkd_jax import store
 from sfkd_jax.certificate import Refusal
 from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.policy._trained import TrainedModel, policy_file
+from sfkd_jax.systems import SystemCertificate
+
+Certified: TypeAlias = DrivingCertificate | SystemCertificate
+"""The certificate of a policy."""
 
 CERTIFICATE = "certificate.json"
 """The certificate in a run directory."""
@@ -16,6 +23,43 @@ RECORDED = "certificate.runs.json"
 """The certificate with the corridor of recorded runs; it is read in place of the other
 where both exist.
 """
+
+
+class SavedHashes(NamedTuple):
+    """What a policy that was saved is known by.
+
+    Attributes:
+        weights_sha256: hash of its weights.
+        certificate_sha256: hash of the file of its certificate; None without one.
+    """
+
+    weights_sha256: str
+    certificate_sha256: str | None
+
+
+def save_certificate(
+    folder: Path, manifest: dict[str, Any], certificate: Certified | None
+) -> SavedHashes:
+    """Write the verified certificate of a policy beside it.
+
+    It refers to the settings as they were saved, perhaps with another controller.
+
+    Args:
+        folder: of the policy.
+        manifest: of the file of the policy.
+        certificate: to write; None if there is none.
+    """
+    path = folder / CERTIFICATE
+    if certificate is None:
+        path.unlink(missing_ok=True)
+        return SavedHashes(manifest["sha256"], None)
+    provenance = replace(
+        certificate.provenance, policy_sha256=manifest["content_sha256"]
+    )
+    # A signature stays if this changes nothing.
+    certificates.write(path, replace(certificate, provenance=provenance))
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return SavedHashes(manifest["sha256"], digest)
 
 
 def read_certificate(

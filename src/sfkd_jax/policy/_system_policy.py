@@ -14,7 +14,7 @@ import numpy as np
 from sfkd_jax import certificate as certificates
 from sfkd_jax import control, models, store
 from sfkd_jax.certificate import Refusal
-from sfkd_jax.policy._certificate import CERTIFICATE
+from sfkd_jax.policy._certificate import CERTIFICATE, SavedHashes, save_certificate
 from sfkd_jax.policy._trained import (
     LAW,
     arrays_of,
@@ -22,7 +22,7 @@ from sfkd_jax.policy._trained import (
     params_from_arrays,
     policy_numerics,
 )
-from sfkd_jax.rollout import fold, on_host
+from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import Values
 from sfkd_jax.systems import (
     ClosedLoop,
@@ -40,7 +40,7 @@ from sfkd_jax.types import Control, Controller, Environment, Model, Params, Spac
 
 FILE = "system.safetensors"
 """The policy of a system in its run directory."""
-KIND = "system"
+SYSTEM_KIND = "system"
 """The kind of artefact that its manifest states."""
 
 
@@ -93,6 +93,56 @@ class SystemPolicy(TrainedSystem):
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs, in the order of `info.claim.bound`."""
         return tuple(self.loop.tracked.rows)
+
+    @property
+    def reference_shape(self) -> tuple[int, int]:
+        """Shape of the reference that `act` takes: a row now and at the next steps."""
+        return self.horizon + 1, len(self.reference_names)
+
+    @property
+    def weights(self) -> Params:
+        """The learned parameters as they were saved, to train on or to save again."""
+        return unfold(self.params)
+
+    @property
+    def interface(self) -> dict[str, Any]:
+        """Names, units and limits of controls, observation, e, reference and outputs.
+
+        "place" is the reference in the middle of its ranges, and the state there.
+        """
+        tracked = self.loop.tracked
+        system = tracked.system
+        labels = [state.label for state in system.state_variables]
+        low, high = system.env_box
+        middle = np.asarray(tracked.middle)
+        at_rest = tracked.state(jnp.zeros(len(labels)), tracked.middle)
+        return {
+            "sampling_period_s": system.dt,
+            "horizon": self.horizon,
+            "controls": [
+                {"name": name, "low": ends[0], "high": ends[1]}
+                for name, ends in system.controls.items()
+            ],
+            "observation": labels,
+            "environment": {
+                "names": list(system.environment),
+                "low": list(low),
+                "high": list(high),
+            },
+            "reference": [labels[index] for index in tracked.followed],
+            "outputs": self.model.frame.units,
+            "place": {
+                "observation": np.asarray(at_rest).tolist(),
+                "reference": middle.tolist(),
+            },
+        }
+
+    def save(self, folder: Path) -> SavedHashes:
+        """Write the policy and its certificate, for `load`."""
+        path = system_file(folder)
+        law = self.loop.law
+        manifest = save_system(path, self.weights, law, self.settings)
+        return save_certificate(folder, manifest, self.certificate)
 
     def shield(self, planner: Controller) -> Controller:
         """Return any planner behind the shield of this policy, to be called like it.
@@ -177,7 +227,7 @@ def save_system(
 ) -> dict[str, Any]:
     """Write the policy of a system, and return its manifest."""
     arrays = arrays_of({**params, LAW: law._asdict()})
-    return store.write_arrays(path, arrays, kind=KIND, config=settings)
+    return store.write_arrays(path, arrays, kind=SYSTEM_KIND, config=settings)
 
 
 @policy_numerics()
@@ -189,7 +239,7 @@ def restore_system(path: str | Path) -> TrainedSystem:
             written, or does not fit its settings.
     """
     file = system_file(path)
-    arrays, manifest = store.read_arrays(file, kind=KIND)
+    arrays, manifest = store.read_arrays(file, kind=SYSTEM_KIND)
     settings = manifest["config"]
     with store.as_artefact_error(file, ValueError, TypeError, KeyError):
         tracked = _tracked_from(settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import matplotlib
 import numpy as np
@@ -29,7 +29,6 @@ from sfkd_jax.report.frames import (
     seen_from,
     surface_colour,
 )
-from sfkd_jax.report.lane_film import LaneFilm as LaneFilm
 from sfkd_jax.report.tables import NO_MODEL
 
 _LOST = 0.85
@@ -93,7 +92,22 @@ def film_of(
     return write(path, Film(cars, last, corridor))
 
 
-def write(path: Path, film: Film | LaneFilm) -> Path:
+@runtime_checkable
+class Frames(Protocol):
+    """What can be written as a film.
+
+    Attributes:
+        dt: sampling period [s]; a frame lasts `EVERY` of them.
+    """
+
+    dt: float
+
+    def frames(self) -> Iterator[Image.Image]:
+        """Yield the frames."""
+        ...
+
+
+def write(path: Path, film: Frames) -> Path:
     """Write the GIF of a film, in real time."""
     # Defaults: a user's style file would move axes that are placed by hand.
     with matplotlib.rc_context():

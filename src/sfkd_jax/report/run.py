@@ -21,6 +21,15 @@ from sfkd_jax.report import figures, style, tables
 from sfkd_jax.report.episodes import Episodes, by_road, of_rows
 from sfkd_jax.report.film import film_of
 from sfkd_jax.report.pages import Part, Picture, Section, to_latex, write_page
+from sfkd_jax.report.sections import (
+    PROOF,
+    certificate_document,
+    empty_folder,
+    holds,
+    learned,
+    made_with,
+    read_optional,
+)
 from sfkd_jax.report.tables import grouped, record_table, title_of
 
 MADE_BY = {
@@ -29,12 +38,6 @@ MADE_BY = {
     "open_loop.json": "train",
 }
 """File of a run -> the command that makes it."""
-PROOF = (
-    "Proved: recomputed from the stored weights, for every state, command and "
-    "environment in the boxes. Measured: a quantile over runs that training never saw, "
-    "promised for further runs under the same conditions. Unsigned: whoever can write "
-    "the file can change such a number. Outside the boxes nothing is claimed."
-)
 
 
 def _range(ends: list[Any] | None) -> str:
@@ -81,47 +84,6 @@ def write_report(run_dir: Path) -> dict[str, Any]:
         )
 
 
-def read_optional(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; it is empty if there is no file."""
-    return store.read_json(path) if path.exists() else {}
-
-
-def certificate_document(run: Path, policy: dict[str, Any]) -> dict[str, Any]:
-    """Return the certificate of a run; one about other weights is not valid."""
-    certificate = read_optional(run / "certificate.json")
-    weights = policy.get("sha256")
-    certified_weights = dig(certificate, "provenance", "weights_sha256")
-    # Valid for other weights is not valid here: the page must not show it.
-    if weights and certified_weights and weights != certified_weights:
-        reason = "the certificate in this run is about other weights"
-        return {"valid": False, "reason": reason}
-    return certificate
-
-
-def holds(certificate: dict[str, Any]) -> bool:
-    """Return whether a certificate is valid, with a contraction factor below one."""
-    alpha: Any = dig(certificate, "proof", "alpha")
-    return certificate.get("valid") is True and is_number(alpha) and alpha < 1
-
-
-def empty_folder(folder: Path) -> Path:
-    """Make a folder for images, without those of an earlier page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    # An earlier page may have had more figures, which would stay among the new ones.
-    for stale in (*folder.glob("*.png"), *folder.glob("*.gif")):
-        stale.unlink()
-    return folder
-
-
-def made_with(config: dict[str, Any], versions: Any) -> Section:
-    """Return a folded section with the command, the settings and the versions."""
-    parts: list[Part] = [
-        record_table("Setting", config, "value"),
-        record_table("Package", versions or {}, "version"),
-    ]
-    return Section("Command, settings and versions", parts, folded=True)
-
-
 def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Section]:
     """Return all sections of the page; an error names the file that does not fit."""
     results = read_optional(run_dir / "results.json")
@@ -147,7 +109,7 @@ def _sections(run_dir: Path, policy: dict[str, Any], images: Path) -> list[Secti
     add("Episodes", "results.json", _driven, run_dir, half_width, images, rows)
     add("Certificate", "certificate.json", _certified, certificate, policy)
     add("Open loop", "open_loop.json", _predicted, run_dir, proof, images)
-    add("Training", "metrics.jsonl", _learned, run_dir, images)
+    add("Training", "metrics.jsonl", learned, run_dir, images)
     command = dig(results, "config", "command")
     config = {"command": command, **(policy.get("config") or {})}
     versions = policy.get("versions") or results.get("versions")
@@ -280,16 +242,6 @@ def _predicted(run_dir: Path, proof: dict[str, Any], images: Path) -> list[Part]
         Picture(path, "Prediction error by time ahead"),
         f"{number} trajectories that training never saw.",
     ]
-
-
-def _learned(run_dir: Path, images: Path) -> list[Part]:
-    """Draw the loss by optimisation step."""
-    log = run_dir / "metrics.jsonl"
-    lines = store.read_jsonl(log) if log.exists() else []
-    if not lines:
-        return []
-    path = style.save(images / "learning.png", figures.learning, lines)
-    return [Picture(path, "Loss by optimisation step")]
 
 
 _TABLE = ("inner_loop", "latency", "sampling")

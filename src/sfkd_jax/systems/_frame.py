@@ -20,9 +20,9 @@ class Tracking:
     no chain, such as the roll of a quadrotor, stay as they are in ξ. A chain of one
     state is a set point that moves at a limited rate.
 
-    A body that moves where it points, such as a car, has a course: the two entries of
-    its position, its heading, and its speed. Then the position of the reference moves
-    with the speed of the reference in the direction of its heading, and the entries of
+    A body that moves where it points, such as a robot on wheels, has a course: the two
+    entries of its position, its direction, and its velocity along it. Then the position
+    of the reference moves with its velocity in its direction, and the entries of
     the position in ξ are along the reference and to its left:
 
         ṗ_ref = v_ref (cos ψ_ref, sin ψ_ref),   ξ_p = R(ψ_ref)' (p - p_ref)
@@ -36,9 +36,9 @@ class Tracking:
         dwell: shortest and longest time between two changes of the reference [s].
         held: states whose ξ is 0 where the system follows its reference, as many as
             there are controls; () for the first state of every chain, and for the
-            position in place of heading and speed where there is a course.
-        course: two states of a position, heading and speed; the last two are in chains.
-            () if no body moves where it points.
+            position in place of direction and velocity where there is a course.
+        course: two states of a position, direction and velocity; the last two are in
+            chains. () if no body moves where it points.
 
     Raises:
         ValueError: a chain, a range or an output does not fit; gives the reason.
@@ -165,13 +165,13 @@ def _check_states(what: str, states: Any) -> None:
 
 
 def _check_course(course: Any, chained: list[str]) -> None:
-    """Raise a ValueError unless this is a course with heading and speed in chains."""
+    """Raise a ValueError unless direction and velocity of a course are in chains."""
     if course == ():
         return
     _check_states("course", course)
     if len(course) != 4 or len(set(course)) < 4:
         raise ValueError(
-            f"course: two states of a position, heading and speed, got {course}"
+            f"course: two states of a position, direction and velocity, got {course}"
         )
     for state in course[:2]:
         if state in chained:

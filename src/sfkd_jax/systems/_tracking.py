@@ -94,7 +94,7 @@ class Tracked:
 
     @cached_property
     def _course_of(self) -> tuple[int, ...]:
-        """Entries of the reference that are the heading and the speed of a course."""
+        """Entries of the reference that are direction and velocity of a course."""
         return tuple(map(self.frame.followed.index, self.frame.course[2:]))
 
     @property
@@ -186,11 +186,12 @@ class Tracked:
             rooms.extend([0.5 * room * dt, room] if len(chain) == 2 else [room])
         sizes = jnp.abs(reference)
         if self.frame.course:
-            # Of a turn and of a change of speed within the rooms above.
-            speed = jnp.linalg.norm(self._velocity(reference))
-            of_heading = rooms[self._course_of[0]]
-            of_speed = rooms[self._course_of[1]]
-            rooms.extend([(speed * of_heading + of_speed) * dt] * 2)
+            # Of a turn and of a change of velocity within the rooms above.
+            rate = jnp.linalg.norm(self._velocity(reference))
+            of_direction = rooms[self._course_of[0]]
+            of_velocity = rooms[self._course_of[1]]
+            room = (rate * of_direction + of_velocity) * dt
+            rooms.extend([room, room])
             # In the axes of the reference each entry has the rounding of both.
             sizes = sizes.at[-2:].set(jnp.max(sizes[-2:]))
         epsilon = jnp.finfo(reference.dtype).eps
@@ -270,17 +271,17 @@ class Tracked:
         return whole.at[np.asarray(self.followed)].set(reference)
 
     def _turned(self, error: Error, reference: ReferenceState, side: float) -> Error:
-        """Return an error whose position is turned by the heading of the reference.
+        """Return an error whose position is turned by the direction of the reference.
 
         Args:
             error: in either axes.
-            reference: with the heading.
+            reference: with the direction.
             side: 1 from the axes of the reference to those of the world, -1 back.
         """
         if not self.frame.course:
             return error
-        heading = side * reference[self._course_of[0]]
-        turned = rotate(heading, error[self.position])
+        direction = side * reference[self._course_of[0]]
+        turned = rotate(direction, error[self.position])
         return error.at[self.position].set(turned)
 
     def _chains(
@@ -300,9 +301,9 @@ class Tracked:
 
     def _velocity(self, chained: Float[Array, " chained"]) -> Float[Array, " 2"]:
         """Return the velocity of a reference with a course, from its chains."""
-        heading = chained[self._course_of[0]]
-        speed = chained[self._course_of[1]]
-        return speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+        direction = chained[self._course_of[0]]
+        velocity = chained[self._course_of[1]]
+        return velocity * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
 
     def _reference_of(self, inputs: Inputs) -> ReferenceState:
         """Return a reference with this ρ; what ρ does not say is 0."""

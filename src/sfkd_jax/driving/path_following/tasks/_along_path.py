@@ -7,7 +7,6 @@ is a `Preview`. `along_reference` turns it into one that sees poses in the world
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -203,9 +202,12 @@ class FollowingLaw(LawTask):
             )
         super().__post_init__()
 
-    @cached_property
+    @property
     def _around_law(self) -> AroundLaw:
-        """Rollouts on roads (κ, v_ref)."""
+        """Rollouts on roads (κ, v_ref).
+
+        Not cached: its arrays belong to the program that is being traced.
+        """
 
         def turn(road: Float[Array, " 2"], env: Environment) -> SteadyTurn:
             return self.law.turn(road[0], road[1], env)
