@@ -47,12 +47,13 @@ GROUND = {
 ROAD = (
     CORE
     | {"schedules", "tables"}
-    | {f"driving.{name}" for name in ("path_coordinates", "paths", "lanes")}
+    | {f"driving.{name}" for name in ("path_coordinates", "paths", "lanes", "sizes")}
 )
 PLANT = ROAD | {"driving.plants", "driving.scenarios"}
 DRIVING = {
     "driving": set(),
     "driving.path_coordinates": {"types", "geometry"},
+    "driving.sizes": set(),
     "driving.smoothing": set(),
     "driving.paths": {"types", "driving.smoothing"},
     "driving.lanes": {"types", "geometry", "driving.paths"},

@@ -119,6 +119,36 @@ def test_delays_of_another_number_of_sensors_are_refused():
         sfkd_jax.load("kinematic", latency=LATENCY)
 
 
+@pytest.mark.parametrize(
+    ("vehicle", "latency"),
+    [("kinematic", None), ("kinematic_path", None), ("kinematic_path", LATENCY)],
+)
+def test_a_horizon_without_a_curvature_is_refused(vehicle, latency):
+    saved = sfkd_jax.load(vehicle).settings["controller"]
+    search = saved["mppi"] | {"horizon": 1}
+    with pytest.raises(ValueError, match=r"controller\.mppi\.horizon=1 is too short"):
+        sfkd_jax.load(vehicle, controller=saved | {"mppi": search}, latency=latency)
+
+
+def test_the_shortest_horizon_drives_with_a_latency():
+    saved = sfkd_jax.load("kinematic_path").settings["controller"]
+    search = saved["mppi"] | {"horizon": 2, "num_samples": 20}
+    short = sfkd_jax.load(
+        "kinematic_path", controller=saved | {"mppi": search}, latency=LATENCY
+    )
+    points = jnp.zeros((short.interface["horizon"], 4)).at[:, 3].set(10.0)
+    points = points.at[:, 0].set(jnp.arange(1.0, 1.0 + len(points)))
+    control, _, info = jit(short.controller.act)(
+        short.params,
+        short.controller.init(jax.random.key(0)),
+        jnp.asarray([0.0, 0.0, 0.0, 10.0]),
+        jnp.asarray([0.5, 0.0]),
+        points,
+    )
+    assert np.isfinite(control).all()
+    assert np.isfinite(info.claim.bound)
+
+
 def test_an_export_states_its_latency_to_whoever_loads_it(late, tmp_path):
     """Its programs compensate it, so its policy must not drive without."""
     settings = late.settings | {

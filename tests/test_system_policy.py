@@ -74,6 +74,7 @@ def test_the_policy_is_loaded_with_its_verified_certificate(certified):
     assert again.horizon == SETTINGS["horizon"]
     lines = repr(again).splitlines()
     assert len(lines) <= 10
+    assert repr(again).isascii()
     bounds = again.certificate.tubes.outputs["position"]
     assert f"|position| <= {bounds.total:.4g} m" in lines[-1]
     assert bounds.total == bounds.tube + bounds.nominal

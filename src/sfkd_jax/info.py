@@ -41,6 +41,7 @@ class Reason(IntEnum):
     BRAKING = 14
     INFEASIBLE = 15
     EVADING = 16
+    REVERSING = 17
 
     @property
     def advice(self) -> str:
@@ -91,6 +92,10 @@ _ADVICE = {
     Reason.INFEASIBLE: "The law alone does not keep the nominal model in its corridor.",
     Reason.EVADING: (
         "It evades outside the certified references, or did so a short time ago."
+    ),
+    Reason.REVERSING: (
+        "It backs up before something that is too near to turn away from; no "
+        "certificate covers driving backwards."
     ),
 }
 
@@ -256,6 +261,8 @@ class LaneInfo(NamedTuple):
         admissible: whether the committed reference is free, and inside class and lane.
         stopping: whether it ends at rest.
         evading: whether it is outside the class.
+        waiting: whether it ends at rest before something that is in the way.
+        reversing: whether it goes backwards, away from that, see `Reversing`.
     """
 
     reference: Float[Array, "horizon 4"]
@@ -265,6 +272,8 @@ class LaneInfo(NamedTuple):
     admissible: Flag
     stopping: Flag
     evading: Flag
+    waiting: Flag = False
+    reversing: Flag = False
 
 
 class ControllerInfo(NamedTuple):

@@ -94,6 +94,9 @@ def imported(name: str, setting: str) -> Any:
 
 
 def in_words(names: Iterable[str], low: Iterable[float], high: Iterable[float]) -> str:
-    """Return names with their limits for a person, as in "v [m/s] 3 … 12, …"."""
+    """Return names with their limits for a person, as in "v [m/s] 3 to 12, …".
+
+    They are printed, also where the output is ASCII alone.
+    """
     rows = zip(names, low, high, strict=False)
-    return ", ".join(f"{name} {least:.3g} … {most:.3g}" for name, least, most in rows)
+    return ", ".join(f"{name} {least:.3g} to {most:.3g}" for name, least, most in rows)

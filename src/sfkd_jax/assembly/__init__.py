@@ -43,6 +43,7 @@ from sfkd_jax.assembly._vehicles import takes_logs as takes_logs
 from sfkd_jax.driving import path_following, plants, scenarios
 from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
+from sfkd_jax.driving.sizes import length_scale
 from sfkd_jax.settings import (
     BelowRoot,
     OneOf,
@@ -66,7 +67,10 @@ LAWS_ALONE = {f"law_{model}": model for model in LAW_MODELS}
 Directory = Annotated[str, BelowRoot()]
 
 
-@takes(scenarios.scenario, skip=("state_size", "dt", "duration", "env_low", "env_high"))
+@takes(
+    scenarios.scenario,
+    skip=("state_size", "dt", "duration", "env_low", "env_high", "scale"),
+)
 class ScenarioSettings:
     """Friction, wind and road, as arguments of `scenario`."""
 
@@ -96,6 +100,7 @@ def build_scenario(
         duration=duration,
         state_size=len(plant.state_names),
         dt=plant.dt,
+        scale=length_scale(plant.wheelbase),
     )
 
 

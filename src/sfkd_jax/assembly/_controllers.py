@@ -27,6 +27,8 @@ from sfkd_jax.rollout import with_offset
 from sfkd_jax.settings import Values, arguments, choose, parse
 from sfkd_jax.types import Controller, Model
 
+FEWEST_STEPS = 2
+"""Steps of a reference that have a curvature between them."""
 MODEL_ERROR = {
     "e_y": 1e-3,
     "e_psi": 3e-4,
@@ -70,11 +72,16 @@ def build_controller(
         latency: of the vehicle, which a controller along a path takes into account.
 
     Raises:
-        ValueError: an unknown planner, a vehicle without limits of its controls, a
-            model and a planner in different coordinates, or adaptation or latency
-            without path coordinates.
+        ValueError: an unknown planner, a horizon of one step, a vehicle without limits
+            of its controls, a model and a planner in different coordinates, or
+            adaptation or latency without path coordinates.
     """
     settings = parse(ControllerSettings, settings, "controller.")
+    if settings.horizon < FEWEST_STEPS:
+        raise ValueError(
+            f"controller.{settings.planner}.horizon={settings.horizon} is too short: "
+            f"the curvature of a road is that between {FEWEST_STEPS} points"
+        )
     # A vehicle of logs has no limits before its logs are read.
     if not plant.control_low:
         raise ValueError(

@@ -13,14 +13,13 @@ from typing import Any, NamedTuple
 
 from sfkd_jax.driving.plants import KNOWN_STATES, described
 from sfkd_jax.driving.scenarios import DriveClass
+from sfkd_jax.driving.sizes import length_scale
 from sfkd_jax.experiment.options import Settings
 from sfkd_jax.settings import replace
 from sfkd_jax.store import plain
 
-CAR_WHEELBASE = 2.7
-"""Wheelbase of the car that the defaults are for [m]."""
 CAR_CLASS = DriveClass()
-"""Its class of drives."""
+"""Class of drives of the car that the defaults are for."""
 GENTLE = 0.25
 """Curvature of the class, at most, relative to that of the steering at its limit."""
 IN_RESERVE = 1.5
@@ -233,7 +232,7 @@ def scale_of(vehicle: Any, speed: tuple[float, float] | None = None) -> Scale:
         speed: range of its speeds [m/s]. Without one they grow with the root of the
             length, as those of bodies under the same gravity do.
     """
-    length = vehicle.wheelbase / CAR_WHEELBASE
+    length = length_scale(vehicle.wheelbase)
     ratio = math.sqrt(length)
     if speed is not None:
         ratio = speed[1] / CAR_CLASS.speed[1]

@@ -17,8 +17,9 @@ from jaxtyping import Array
 
 from sfkd_jax import policy, store
 from sfkd_jax.driving.lanes import Lane, Obstacles
-from sfkd_jax.driving.path_following import moved_on
+from sfkd_jax.driving.path_following import InLane, moved_on
 from sfkd_jax.driving.paths import Path as Road
+from sfkd_jax.driving.sizes import length_scale
 from sfkd_jax.export._programs import (
     Program,
     Shape,
@@ -184,6 +185,7 @@ def in_window(
         )
     points, obstacles, steps = lane
     driver = trained.in_lane(car=(car[0], car[1]))
+    apart = length_scale(trained.vehicle.wheelbase) * InLane.spacing
     shapes: dict[str, tuple[int, ...]] = {
         "road": (points, 4),
         "spacing": (),
@@ -204,7 +206,7 @@ def in_window(
         road, spacing, left, right, speed, *obstacles, moved = ahead
         window = Road(road, spacing)
         scene = Lane(window, left, right, speed), Obstacles(*obstacles)
-        state = moved_on(state, window, moved)
+        state = moved_on(state, window, moved, apart)
         return driver.act(params, state, observation, env, scene)
 
     dtypes = {"present": bool, "moved": jnp.int32}

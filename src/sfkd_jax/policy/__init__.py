@@ -119,6 +119,7 @@ class Policy(TrainedModel):
         car: tuple[float, float] | None = None,
         planner: str = "mppi",
         capacity: tuple[int, int] | None = None,
+        reverse: bool = False,
     ) -> Controller:
         """Return a controller that drives in a lane, round obstacles, see `InLane`.
 
@@ -132,6 +133,9 @@ class Policy(TrainedModel):
                 `act` is then to be called as it is, from the host: it takes any number
                 of obstacles up to these, and is compiled once. With None it is a pure
                 function, for `jax.jit` and scans, of one number of obstacles each.
+            reverse: whether the vehicle reverses where u_2 is below 0 at rest. It then
+                backs up where it stands too near to something to turn away, without a
+                claim, see `path_following.Reversing`.
 
         Raises:
             ValueError: the policy has no certified corridor.
@@ -154,6 +158,7 @@ class Policy(TrainedModel):
                 car=car or self.vehicle.size,
                 planner=planner,
                 friction=roles.index(FRICTION) if FRICTION in roles else None,
+                reverse=reverse,
             )
         if capacity is not None:
             controller = with_capacity(controller, capacity)

@@ -174,4 +174,4 @@ def _corridor_conditions(conditions: Conditions, env_names: list[str]) -> str:
     shortest, longest = conditions.dwell_s
     dwell = f"{shortest:g} to {longest:g} s"
     bend = conditions.peak_curvature
-    return f"under: {box}, each for {dwell}; curvature [1/m] {-bend:g} … {bend:g}"
+    return f"under: {box}, each for {dwell}; curvature [1/m] {-bend:g} to {bend:g}"

@@ -1,5 +1,6 @@
 """The reference as a plan: lateral moves, obstacles, and what may be committed."""
 
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -24,11 +25,13 @@ from sfkd_jax.driving.path_following.lanes._reference import (
 )
 from sfkd_jax.driving.paths import (
     Lap,
+    Path,
     path_from_curvature,
     path_through,
     point_at,
     quintic,
 )
+from sfkd_jax.driving.sizes import Scale
 from sfkd_jax.info import Claim, ControllerInfo, Reason
 from sfkd_jax.types import Controller
 
@@ -274,14 +277,25 @@ def follower():
     return Controller(lambda key: jnp.zeros(()), act)
 
 
-def lane_with(planner, **settings):
-    """The controller of a lane, and its step as one program."""
-    task = path_following.Manoeuvres(kind=KIND, dt=DT)
-    search = {"horizon": 1, "noise_std": (1.5, 10.0, 1.5, 10.0, 1.0), "noise": "white"}
-    search = planner(task.task(), **search, **settings)
-    driver = path_following.in_lane(
-        inner=follower(), planner=search, manoeuvres=task, horizon=20
+def settings_with(planner, kind=KIND, **settings):
+    """The settings of a controller in a lane."""
+    task = path_following.Manoeuvres.scaled(kind, DT)
+    length, speed = kind.scale
+    noise = (1.5 * length, 10.0 * length, 1.5 * length, 10.0 * length, speed)
+    search = {"horizon": 1, "noise_std": noise, "noise": "white"}
+    return path_following.InLane(
+        inner=follower(),
+        planner=planner(task.task(), **search, **settings),
+        manoeuvres=task,
+        horizon=20,
+        view=100.0 * length,
+        spacing=0.5 * length,
     )
+
+
+def lane_with(planner, kind=KIND, **settings):
+    """The controller of a lane, and its step as one program."""
+    driver = settings_with(planner, kind, **settings).controller()
     return driver, jit(driver.act)
 
 
@@ -364,6 +378,48 @@ def test_it_drives_round_posts_on_a_smooth_reference_of_its_class(lane, road, pl
             before.committed.move[:, moved : moved + SPLICE + 1],
             atol=1e-5,
         )
+
+
+def test_a_small_vehicle_drives_the_same_manoeuvre_in_its_own_units(lane, road):
+    """An eighth of the lengths and of the speeds, up to posts and to a stop."""
+    small = 0.125
+    kind = replace(
+        KIND,
+        curvature=KIND.curvature / small,
+        turning=KIND.turning / small**2,
+        lateral=KIND.lateral * small,
+        jerk=KIND.jerk * small,
+        speed=(8.0 * small, 10.5 * small),
+        half=(2.25 * small, 0.9 * small),
+        corridor=0.14 * small,
+        acceleration=small,
+        deceleration=small,
+        braking=6.0 * small,
+        scale=Scale(small, small),
+    )
+    points = road.path.points * jnp.asarray([small, small, 1.0, 1.0 / small])
+    lanes = {
+        1.0: (lane, road),
+        small: (
+            lane_with(control.mppi, kind, num_samples=100, effective_samples=5.0),
+            lane_along(Path(points, 0.5 * small), width=12.0 * small, speed=10 * small),
+        ),
+    }
+    wall = np.array([[100.0, d] for d in np.arange(-6.0, 6.1, 1.5)])
+    places = beside(road, np.concatenate([POSTS[:2], wall[:7]]))
+    driven = []
+    for scale, (driver, street) in lanes.items():
+        posts = circles(places * scale, 0.8 * scale)
+
+        def seen(number, car, posts=posts):
+            return posts
+
+        # Their grip is so large that only the class limits what they do.
+        rows = drive(driver, street, seen, 110, speed=10.0 * scale, friction=0.9)
+        units = np.array([scale, scale, 1.0, scale])
+        driven.append(np.stack([car for car, _, _ in rows]) / units)
+    np.testing.assert_allclose(driven[1], driven[0], atol=0.02)
+    assert driven[0][-1, 3] < 9.0
 
 
 @pytest.mark.parametrize("wall", ["one", "many"])
@@ -542,6 +598,92 @@ def test_a_lane_too_narrow_for_the_corridor_stops_and_says_so(
         assert bool(info.lane.admissible) != narrow
         assert info.lane.edge == pytest.approx(room, abs=0.01)
     assert (rows[-1][0][3] == 0.0) == narrow
+
+
+WHEELBASE = 2.7
+
+
+@pytest.fixture(scope="module")
+def reversing():
+    driver = path_following.Reversing(
+        lane=settings_with(control.mppi, num_samples=100, effective_samples=5.0),
+        wheelbase=WHEELBASE,
+        low=(-0.5, -6.0),
+        high=(0.5, 3.0),
+        patience=1.0,
+    ).controller()
+    return driver, jit(driver.act)
+
+
+def backed_up(car, control):
+    """A car without slip after a control step, u_2 is an acceleration."""
+    x, y, yaw, speed = car
+    steering, drive = np.asarray(control, np.float64)
+    after = speed + DT * drive
+    way = 0.5 * DT * (speed + after)
+    turned = way * np.tan(steering) / WHEELBASE
+    x += way * np.cos(yaw + 0.5 * turned)
+    y += way * np.sin(yaw + 0.5 * turned)
+    return np.float32([x, y, yaw + turned, after])
+
+
+def drive_back(reversing, road, posts, steps, car):
+    """A car that is where its reference says, if it neither stands nor backs up."""
+    driver, act = reversing
+    state = driver.init(jax.random.key(1))
+    rows = []
+    env = jnp.asarray([0.9, 0.0])
+    for _ in range(steps):
+        command, state, info = act(None, state, car, env, (road, nine(posts)))
+        rows.append((car, info))
+        ahead = np.asarray(info.lane.reference[0])
+        forwards = ahead if ahead[3] > 0.0 else car
+        car = backed_up(car, command) if info.lane.reversing else forwards
+    return rows
+
+
+def test_a_car_too_near_to_turn_backs_up_along_its_lane_and_drives_round(
+    reversing, straight
+):
+    """It stands 2.5 m before a post, aside and turned, in a lane of 10 m."""
+    wide = straight._replace(left=3.0 * straight.left, right=3.0 * straight.right)
+    post = circles(jnp.asarray([[65.0 + 2.5 + 0.8, 0.2]]), 0.8)
+    start = np.float32([65.0 - KIND.half[0], 0.6, 0.1, 0.0])
+    rows = drive_back(reversing, wide, post, 290, start)
+    back = np.array([bool(info.lane.reversing) for _, info in rows])
+    cars = np.stack([car for car, _ in rows])
+    assert not back[:9].any()
+    # Once, and until it stands.
+    assert np.sum(np.diff(back.astype(int)) == 1) == 1
+    ended = np.flatnonzero(back)[-1] + 1
+    assert -0.3 < cars[ended, 3] <= 0.0
+    assert 3.0 < cars[0, 0] - cars[ended, 0] < 30.0
+    assert cars[ended, 1] == pytest.approx(0.6, abs=0.3)
+    assert abs(cars[ended, 2]) < 0.05
+    assert cars[-1, 0] > 80.0
+    assert min(room(car, post) for car in cars) > KIND.margin
+    for _, info in np.array(rows, object)[back]:
+        assert info.claim.reason == Reason.REVERSING
+        assert np.isnan(info.claim.bound)
+    # The errors of the certified law decay first.
+    assert all(info.claim.reason == Reason.EVADING for _, info in rows[ended:][:18])
+    assert rows[-1][1].claim.holds
+
+
+@pytest.mark.parametrize("where", ["behind", "start", "free"])
+def test_it_does_not_back_up_into_what_is_behind_or_without_need(
+    reversing, straight, where
+):
+    """Something near behind, the start of its path, or nothing that stops it."""
+    along = 3.0 if where == "start" else 65.0
+    posts = circles(jnp.asarray([[along + 4.0, 0.0], [along - 4.0, 0.0]]), 0.8)
+    present = jnp.asarray([where != "free", where == "behind"])
+    posts = posts._replace(present=present)
+    rows = drive_back(
+        reversing, straight, posts, 40, np.float32([along, 0.0, 0.0, 0.0])
+    )
+    assert not any(info.lane.reversing for _, info in rows)
+    assert (rows[-1][0][0] > along + 1.0) == (where == "free")
 
 
 @pytest.mark.parametrize("attack", ["inside", "nan", "edge"])

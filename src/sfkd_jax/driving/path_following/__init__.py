@@ -5,6 +5,7 @@ from sfkd_jax.driving.path_following.lanes._in_lane import in_lane as in_lane
 from sfkd_jax.driving.path_following.lanes._in_lane import moved_on as moved_on
 from sfkd_jax.driving.path_following.lanes._judging import Class as Class
 from sfkd_jax.driving.path_following.lanes._manoeuvre import Manoeuvres as Manoeuvres
+from sfkd_jax.driving.path_following.lanes._reversing import Reversing as Reversing
 from sfkd_jax.driving.path_following.laws._derivation import (
     by_differences as by_differences,
 )

@@ -13,6 +13,7 @@ from sfkd_jax.driving.plants._variables import (
     ACCELERATION,
     SPEED_COMMAND,
     STEERING,
+    body_size,
     states_of,
 )
 from sfkd_jax.driving.plants._vehicle import Vehicle, nominal_derivative, rk4
@@ -100,6 +101,7 @@ def own(
         wind_force=wind_force,
         speed_loop=speed_loop,
         simulated=step is not None,
+        size=body_size(wheelbase),
         hidden=len(hidden_names),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from sfkd_jax.driving.sizes import CAR_LENGTH, CAR_WIDTH, length_scale
 from sfkd_jax.variables import ControlVariable, EnvironmentVariable, StateVariable
 
 
@@ -49,8 +50,17 @@ FRICTION_AND_WIND = (
     EnvironmentVariable("lateral wind", "m/s"),
 )
 """e, unless `environment.names` or the columns of logs say otherwise."""
-CAR_SIZE = Size(4.5, 2.0)
-"""Size of every vehicle that does not state one."""
+CAR_SIZE = Size(CAR_LENGTH, CAR_WIDTH)
+"""Size of a car."""
+
+
+def body_size(wheelbase: float) -> Size:
+    """Return the size of a body that is not stated.
+
+    It is that of a car in the scale of its wheelbase [m]. Long vehicles are no wider.
+    """
+    scale = length_scale(wheelbase)
+    return Size(scale * CAR_SIZE.length, min(scale, 1.0) * CAR_SIZE.width)
 
 
 FRICTION = "friction"

@@ -25,13 +25,25 @@ from sfkd_jax.schedules import within
 from sfkd_jax.types import Key, Scalar, State
 
 RUN_UP = 20.0
-"""Length over which the curvature of a path is blended in [m]."""
+"""Length over which the curvature of a path is blended in; of a car [m]."""
 FIRST = 70.0
-"""Smallest arc length of the first obstacle [m]. It is out of sight at the start."""
+"""Smallest arc length of the first obstacle [m]; of a car. It is out of sight at the
+start.
+"""
 GAP = (40.0, 60.0)
-"""Range of the distance from one obstacle to the next [m]."""
+"""Range of the distance from one obstacle to the next; of a car [m]."""
 PASSED = 15.0
-"""Distance behind the car from which on an obstacle counts as passed [m]."""
+"""Distance behind the car from which on an obstacle counts as passed; of a car [m]."""
+IN_SIGHT = 60.0
+"""Distance from which on it is seen; of a car [m]."""
+RADIUS = 0.8
+"""Of an obstacle; of a car [m]."""
+ASIDE = 1.5
+"""Largest distance of an obstacle from the path; of a car [m]."""
+ROOM = 10.5
+"""Width of a lane with obstacles, three times the usual one; of a car [m]."""
+FREE = 50.0
+"""Length of the end of the path without obstacles; of a car [m]."""
 IN_VIEW = 4
 """Number of obstacles that a controller is shown: those that are passed next."""
 
@@ -44,35 +56,46 @@ class Course(NamedTuple):
         obstacles: all of them, in the order in which they are passed.
         along: arc length of the path beside each obstacle [m], rising, (obstacle,).
         view: distance along the path from which on each is seen [m], (obstacle,).
+        passed: distance behind the car from which on one counts as passed [m].
     """
 
     lane: Lane
     obstacles: Obstacles
     along: Float[Array, " obstacle"]
     view: Float[Array, " obstacle"]
+    passed: Scalar
 
 
-def random_course(key: Key, path: Path, *, speed: float = 10.0) -> Course:
-    """Draw obstacles up to 1.5 m beside a path, of radius 0.8 m, seen from 60 m on.
+def random_course(
+    key: Key, path: Path, *, speed: float = 10.0, scale: float = 1.0
+) -> Course:
+    """Draw round obstacles beside a path, which come into sight one after the other.
 
-    The lane is three usual lanes wide, so that the car may pass each obstacle on either
-    side.
+    The lane is so wide that the car may pass each obstacle on either side.
 
     Args:
         key: consumed.
-        path: open. Its last 50 m stay free.
+        path: open. Its end stays free.
         speed: wanted speed on the lane [m/s].
+        scale: of the lengths of the vehicle, see `sizes.length_scale`.
     """
     gap_key, offset_key = jax.random.split(key)
     length = (path.points.shape[0] - 1) * SPACING
+    first = scale * FIRST
+    gap = (scale * GAP[0], scale * GAP[1])
+    aside = (-scale * ASIDE, scale * ASIDE)
     # Enough even if all gaps are the shortest, and no fewer than are shown at once.
-    count = max(int((length - FIRST) / GAP[0]), IN_VIEW)
-    along = FIRST - GAP[0] + jnp.cumsum(within(GAP, gap_key, count))
-    aside = within((-1.5, 1.5), offset_key, count)
-    obstacles = circles(beside(path, along, aside), 0.8)
-    obstacles = obstacles._replace(present=along <= path.length - 50.0)
-    lane = lane_along(path, width=10.5, speed=speed)
-    return Course(lane, obstacles, along, jnp.full(count, 60.0))
+    count = max(int((length - first) / gap[0]), IN_VIEW)
+    along = first - gap[0] + jnp.cumsum(within(gap, gap_key, count))
+    places = beside(path, along, within(aside, offset_key, count))
+    obstacles = circles(places, scale * RADIUS)
+    return Course(
+        lane=lane_along(path, width=scale * ROOM, speed=speed),
+        obstacles=obstacles._replace(present=along <= path.length - scale * FREE),
+        along=along,
+        view=jnp.full(count, scale * IN_SIGHT),
+        passed=jnp.asarray(scale * PASSED),
+    )
 
 
 def beside(
@@ -98,7 +121,9 @@ def in_view(course: Course, progress: Scalar) -> Obstacles:
         progress: arc length of the car [m].
     """
     ahead = course.along - progress
-    first = jnp.clip(jnp.sum(ahead < -PASSED), 0, course.along.shape[0] - IN_VIEW)
+    first = jnp.clip(
+        jnp.sum(ahead < -course.passed), 0, course.along.shape[0] - IN_VIEW
+    )
     present = course.obstacles.present & (ahead <= course.view)
     obstacles = course.obstacles._replace(present=present)
     # The window has a constant size, so that a controller is compiled once for all
@@ -167,7 +192,8 @@ steps=number of time steps, dt=sampling period [s]) and returns e_0 … e_{T-1}.
 """
 COURSES: dict[str, Callable[..., Course]] = {"obstacles": random_course}
 """Obstacles by the name of the scenario, for those scenarios that have any. Each is
-called with (key, path, speed=v [m/s]) and returns a course on the path.
+called with (key, path, speed=v [m/s], scale=of the vehicle) and returns a course on the
+path.
 """
 
 
@@ -182,6 +208,7 @@ def scenario(
     dt: float,
     env_low: tuple[float, ...] = BOX[0],
     env_high: tuple[float, ...] = BOX[1],
+    scale: float = 1.0,
 ) -> Family:
     """Return a family of the benchmark by name, see `ROADS`, in any box of e.
 
@@ -196,6 +223,7 @@ def scenario(
         dt: sampling period [s].
         env_low: lower corner of E, see `in_box`.
         env_high: upper corner of E.
+        scale: of the lengths of the vehicle, and so of run-up and obstacles.
 
     Raises:
         ValueError: no scenario has this name.
@@ -212,8 +240,11 @@ def scenario(
         length=speed * duration * 1.1 + 50.0,
         peak_curvature=peak_curvature,
         wavelengths=wavelengths,
+        run_up=scale * RUN_UP,
     )
-    courses = partial(COURSES[name], speed=speed) if name in COURSES else None
+    courses = None
+    if name in COURSES:
+        courses = partial(COURSES[name], speed=speed, scale=scale)
 
     def conditions(key: Key) -> Float[Array, "time environment"]:
         return in_box(schedule(key, steps=steps, dt=dt), env_low, env_high)
@@ -268,6 +299,7 @@ def smooth_path(
     length: float,
     peak_curvature: float = 0.02,
     wavelengths: tuple[float, float] = (50.0, 160.0),
+    run_up: float = RUN_UP,
 ) -> Path:
     """Draw a path whose curvature is a sum of three sinusoids.
 
@@ -280,6 +312,7 @@ def smooth_path(
         length: smallest length [m].
         peak_curvature: κ_max [1/m].
         wavelengths: range of λᵢ [m].
+        run_up: length over which the curvature is blended in [m].
     """
     amplitude_key, wavelength_key, phase_key = jax.random.split(key, 3)
     s = jnp.arange(int(length / SPACING) + 2) * SPACING
@@ -288,7 +321,7 @@ def smooth_path(
     waves = within(wavelengths, wavelength_key, 3, 1)
     phases = jax.random.uniform(phase_key, (3, 1), maxval=2 * jnp.pi)
     curvature = jnp.sum(amplitudes * jnp.sin(2 * jnp.pi * s / waves + phases), axis=0)
-    blend = jnp.clip(s / RUN_UP, 0.0, 1.0)
+    blend = jnp.clip(s / run_up, 0.0, 1.0)
     # Smoothstep: the curvature and its slope start at 0, as the steering does.
     curvature = curvature * blend**2 * (3.0 - 2.0 * blend)
     # Scaled after the blend, so that the path itself reaches the peak.

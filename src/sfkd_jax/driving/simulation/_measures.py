@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sfkd_jax.driving.sizes import CAR_LENGTH
 from sfkd_jax.info import ControllerInfo
 
 PerEpisode: TypeAlias = Float[np.ndarray, " episode"] | Bool[np.ndarray, " episode"]
@@ -21,7 +22,9 @@ SETTLING = 2.0
 system [s].
 """
 LANE_HALF_WIDTH = 1.75
-"""Half width of the lane that a car has to stay in [m]."""
+"""Half width of the lane that a car has to stay in [m]. That of a small vehicle is as
+much narrower as the vehicle is shorter.
+"""
 MIRROR = 0.1
 """Width of a mirror [m]. The body without mirrors has to stay in the lane, and this is
 how committed departures were counted; the whole width has to keep clear of obstacles.
@@ -86,8 +89,10 @@ def room_in_lane(size: tuple[float, float]) -> float:
     Args:
         size: length and width of the car [m].
     """
+    # Roads are no wider for long vehicles.
+    scale = min(size[0] / CAR_LENGTH, 1.0)
     # The side of the car has to stay in the lane, and not only its centre.
-    return LANE_HALF_WIDTH - (0.5 * size[1] - MIRROR)
+    return scale * LANE_HALF_WIDTH - (0.5 * size[1] - scale * MIRROR)
 
 
 def departed(run: Recording) -> np.ndarray:

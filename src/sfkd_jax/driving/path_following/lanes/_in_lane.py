@@ -49,7 +49,7 @@ from sfkd_jax.types import (
 Scene: TypeAlias = tuple[Lane, Obstacles]
 """The lane and what is seen in it."""
 LOST = 10.0
-"""Distance from the expected place beyond which the car is somewhere else [m]."""
+"""Distance from the expected place beyond which it is somewhere else; of a car [m]."""
 
 
 class LaneState(NamedTuple):
@@ -221,6 +221,8 @@ class InLane(Stateful):
                 admissible=judged.violation <= 0.0,
                 stopping=~judged.curve.reached[-1],
                 evading=evading,
+                waiting=jnp.any(~judged.curve.reached & (situation.road.wanted > 0.0)),
+                reversing=jnp.asarray(False),
             ),
         )
         wait = jnp.where(due, self.period, state.wait) - 1
@@ -289,7 +291,8 @@ class InLane(Stateful):
         away = jnp.linalg.norm(position - point_at(path, guess)[:2])
         # A road may cross itself. The nearest point of all counts only if the car is
         # not near the expected one.
-        fresh = known & ~(state.started & (away < LOST))
+        near = away < LOST * limits.scale.length
+        fresh = known & ~(state.started & near)
         nearest = jnp.argmin(jnp.sum((path.points[:, :2] - position) ** 2, axis=1))
         start = jnp.where(fresh, nearest * path.spacing, guess)
         progress, lateral = project(path, position, start)
@@ -299,6 +302,8 @@ class InLane(Stateful):
             behind = progress < start - 0.5 * path.length
             index = index - jnp.where(behind, gaps, 0)
         first = jnp.floor(progress / distance).astype(int) - BEHIND
+        # A reference that stands behind a car that rolled back would stand for ever.
+        fresh |= known & (first < index) & (square[BEHIND] <= 0.0)
         first = jnp.where(fresh, first, jnp.maximum(first, index))
         accelerations = (limits.acceleration, limits.deceleration)
         road = road_ahead(lane, first, self.samples, accelerations, self.spacing)

@@ -19,15 +19,16 @@ from sfkd_jax.driving.path_following.lanes._reference import (
     RoadAhead,
     curve,
 )
+from sfkd_jax.driving.sizes import CAR, Scale
 from sfkd_jax.ranges import Fraction, NonNegative, Positive, Span, check_intervals
 from sfkd_jax.types import Scalar
 
 ALMOST = 0.95
 """Share of the grip that a stop uses which cannot be gentler."""
-TRACKED = 3.0
-"""Largest v² κ that a law can still follow [m/s²]."""
+TRACKED = 1.5
+"""Largest v² κ that a law can still follow, relative to that of the class."""
 SLOW = 0.5
-"""Speed from which on a car ahead drives [m/s]."""
+"""Speed from which on a vehicle ahead drives; of a car [m/s]."""
 HEADWAY = 1.0
 """Time after which the car has reacted to one ahead that brakes [s]."""
 SOON = 4.0
@@ -35,7 +36,9 @@ SOON = 4.0
 leaves less, and is left to gain it.
 """
 LATE = 0.03
-"""Distance by which an obstacle may be nearer between two samples than at both [m]."""
+"""Distance by which an obstacle may be nearer between two samples than at both; of a
+car [m].
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +59,7 @@ class Class:
         deceleration: largest deceleration in a planned change of speed [m/s²].
         braking: largest deceleration of a stop that cannot be gentler [m/s²].
         share: of the grip that is planned with.
+        scale: of the car.
     """
 
     curvature: Positive
@@ -71,6 +75,7 @@ class Class:
     deceleration: Positive = 1.0
     braking: Positive = 6.0
     share: Fraction = 0.7
+    scale: Scale = CAR
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -79,6 +84,11 @@ class Class:
     def margin(self) -> float:
         """Largest distance of any point of the car from where it should be [m]."""
         return self.corridor + math.hypot(*self.half) * self.heading
+
+    @property
+    def tracked(self) -> float:
+        """Largest v² κ that a law can still follow [m/s²]."""
+        return TRACKED * self.lateral
 
 
 class Situation(NamedTuple):
@@ -177,7 +187,7 @@ class Judge:
             ]
         )
         used = jnp.hypot(square * curvature, change) / (ALMOST * situation.grip)
-        used = jnp.maximum(used, square * jnp.abs(curvature) / TRACKED)
+        used = jnp.maximum(used, square * jnp.abs(curvature) / limits.tracked)
         # What lies before the splice cannot be changed any more.
         outside = jnp.max(jnp.where(along.reached, shares, 0.0)[:, SPLICE:]) - 1.0
         strain = jnp.max(jnp.where(along.reached, used, 0.0)[SPLICE:])
@@ -225,7 +235,7 @@ class Judge:
         free = jnp.full(samples.shape, jnp.inf)
         obstacles = (situation.obstacles, places, situation.counts_from)
         (gap, headway), _ = jax.lax.scan(nearer, (free, free), obstacles)
-        gap = gap - LATE - self.limits.margin
+        gap = gap - LATE * self.limits.scale.length - self.limits.margin
         gap = jnp.where(_counts(along), gap, jnp.inf)
         headway = jnp.min(jnp.where(_counts(along), headway, jnp.inf))
         return jnp.where(situation.clean, gap, -jnp.inf), headway
@@ -266,7 +276,8 @@ class Judge:
         velocity = (obstacle.position[-1] - obstacle.position[-2]) / self.dt
         speed = cos * velocity[0] + sin * velocity[1]
         # Who crosses the road is passed, and who stands is stopped for.
-        drives = speed > jnp.maximum(0.7 * jnp.linalg.norm(velocity), SLOW)
+        slow = SLOW * self.limits.scale.speed
+        drives = speed > jnp.maximum(0.7 * jnp.linalg.norm(velocity), slow)
         in_track = aside < wide + self.limits.half[1] + self.limits.margin
         hardest = jnp.minimum(ALMOST * situation.grip, self.limits.braking)
         closing = jnp.maximum(square - speed**2, 0.0) / (2.0 * hardest)

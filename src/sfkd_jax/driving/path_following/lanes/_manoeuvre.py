@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Any
@@ -15,7 +15,6 @@ from sfkd_jax.control import RolloutSetup, StepResult, Task, constrained
 from sfkd_jax.driving.lanes import beside
 from sfkd_jax.driving.path_following.lanes._judging import (
     ALMOST,
-    TRACKED,
     Class,
     Judge,
     Judged,
@@ -34,7 +33,7 @@ from sfkd_jax.ranges import NonNegative, Positive
 from sfkd_jax.types import Control, Params, Scalar
 
 SHORTEST = 12.0
-"""Shortest lateral move [m]."""
+"""Shortest lateral move; of a car [m]."""
 BEND = 5.77
 """Largest second derivative of a quintic between rests, by its height and length²."""
 EVASIVE = 0.85
@@ -44,7 +43,15 @@ ENDS = range(-5, 6)
 LENGTHS = (0.7, 0.85, 1.0, 1.25)
 """Lengths of evasions, relative to the length that takes all of the grip."""
 GAINED = 0.02
-"""Room that the last resort must leave beyond that of a stop [m]."""
+"""Room that the last resort must leave beyond that of a stop; of a car [m]."""
+SHORTEST_EVASION = 5.0
+"""Shortest lateral move of an evasion; of a car [m]."""
+TOGETHER = 4.0
+"""Distance within which obstacles stand at the same place of the road; of a car [m]."""
+FAR = 30.0
+"""Largest change of a length [m], and of a speed [m/s], that is searched; of a car."""
+SLOWER = (0.0, -2.0, -4.0)
+"""Changes of the speed at which obstacles are passed; of a car [m/s]."""
 BRAKING = (0.0, 0.4, 0.8)
 """Shares of the grip left over by the lateral move that evasions brake with."""
 
@@ -78,6 +85,22 @@ class Manoeuvres:
     standoff: NonNegative = 1.0
     weights: tuple[NonNegative, ...] = (0.02, 1e4, 1e6, 1.0, 1.0)
 
+    @classmethod
+    def scaled(cls, kind: Class, dt: float) -> Manoeuvres:
+        """Return the task of a vehicle, with the defaults of a car in its scale."""
+        of_car = cls(kind=kind, dt=dt)
+        length, speed = kind.scale
+        # Each weight is that of a square.
+        units = (length**-2, length**2, length**4, speed**-2, length**-2)
+        weights = zip(of_car.weights, units, strict=True)
+        return replace(
+            of_car,
+            widest=length * of_car.widest,
+            comfort=length * of_car.comfort,
+            standoff=length * of_car.standoff,
+            weights=tuple(weight * unit for weight, unit in weights),
+        )
+
     @property
     def judge(self) -> Judge:
         """The rules by which references are compared."""
@@ -85,7 +108,9 @@ class Manoeuvres:
 
     def task(self) -> Task:
         """Return the planning problem as functions."""
-        largest = jnp.asarray([self.widest, 30.0, self.widest, 30.0, 30.0])
+        far = FAR * self.kind.scale.length
+        change = FAR * self.kind.scale.speed
+        largest = jnp.asarray([self.widest, far, self.widest, far, change])
 
         def no_check(*_: Any) -> None:
             return None
@@ -126,8 +151,9 @@ class Manoeuvres:
         before = situation.committed
         spacing = road.spacing
         count = before.square.shape[0]
-        longest, middle = _lengths(road)
-        first, second = jnp.clip(row[1:4:2] + middle, SHORTEST, longest)
+        shortest = SHORTEST * self.kind.scale.length
+        longest, middle = _lengths(road, shortest)
+        first, second = jnp.clip(row[1:4:2] + middle, shortest, longest)
         ahead = spacing * jnp.arange(count - SPLICE)
         away = quintic(before.move[:, SPLICE], row[0], first, ahead)[:3]
         start = jnp.stack([row[0], jnp.zeros(()), jnp.zeros(())])
@@ -157,7 +183,8 @@ class Manoeuvres:
         """
         road = situation.road
         spacing = road.spacing
-        longest, middle = _lengths(road)
+        scale = self.kind.scale
+        longest, middle = _lengths(road, SHORTEST * scale.length)
         splice = spacing * SPLICE
         places, ahead = self._ahead(situation)
         # In place of an obstacle that is not there: the middle of the road at the
@@ -179,7 +206,7 @@ class Manoeuvres:
             return jnp.stack([left[1], to_second, left[1], longest - middle, slower])
 
         sides = (1.0, -1.0)
-        speeds = jnp.asarray([0.0, -2.0, -4.0])
+        speeds = scale.speed * jnp.asarray(SLOWER)
         ways = [pass_both(*way) for way in product(sides, sides, speeds)]
         ways += [pass_second(*way) for way in product(sides, speeds)]
         return jnp.stack(ways)
@@ -227,9 +254,10 @@ class Manoeuvres:
         by_turning = jnp.cbrt(60.0 / limits.turning * shift)
         length = jnp.maximum(by_curvature, by_turning) + road.spacing * SPLICE
         length = jnp.min(jnp.where(lacks <= 0.0, length, jnp.inf), axis=0)
-        # All obstacles that stand there together, within 4 m, may block the sample, and
-        # any of them may leave.
-        there = ahead & (jnp.abs(begin - road.spacing * block) < 4.0)
+        # All obstacles that stand there together may block the sample, and any of them
+        # may leave.
+        together = TOGETHER * limits.scale.length
+        there = ahead & (jnp.abs(begin - road.spacing * block) < together)
         length = jnp.where(there & jnp.isfinite(length), length, self.standoff)
         return jnp.max(length)
 
@@ -278,12 +306,13 @@ class Manoeuvres:
         plans = jax.tree.map(joined, stop, situation.committed, moves)
         judged = jax.vmap(partial(self.judge, weights, situation))(plans)
         room = jnp.min(jnp.minimum(judged.gap, judged.edge), axis=1)
-        beyond = 10.0 * jnp.maximum(judged.strain - 1.0, 0.0)
-        worth = jnp.minimum(room, self.comfort) - beyond - 0.05 * judged.strain
+        length = self.kind.scale.length
+        beyond = length * 10.0 * jnp.maximum(judged.strain - 1.0, 0.0)
+        worth = jnp.minimum(room, self.comfort) - beyond - length * 0.05 * judged.strain
         best = jnp.argmax(worth)
         # A car that cannot avoid a collision brakes.
         avoids = (room[0] < 0.0) & (worth[best] > -self.kind.margin)
-        avoids &= room[best] > room[0] + GAINED
+        avoids &= room[best] > room[0] + GAINED * length
         chosen = jnp.where(avoids, best, 0)
         return jax.tree.map(lambda leaf: leaf[chosen], plans)
 
@@ -304,13 +333,14 @@ class Manoeuvres:
         start = before.square[BEHIND]
         count = before.square.shape[0]
         grip = EVASIVE * situation.grip
-        lateral = jnp.minimum(grip, TRACKED)
+        lateral = jnp.minimum(grip, limits.tracked)
         # At low speed the curvature is limited by the class.
         bend = jnp.minimum(lateral / jnp.maximum(start, 0.01), limits.curvature)
         edge = jnp.where(end > 0.0, road.left[SPLICE], road.right[SPLICE])
         end = 0.2 * end * jnp.maximum(edge - limits.half[1] - limits.margin, 0.0)
         aside = jnp.abs(end - before.move[0, SPLICE])
-        length = jnp.maximum(longer * jnp.sqrt(BEND * aside / bend), 5.0)
+        shortest = SHORTEST_EVASION * limits.scale.length
+        length = jnp.maximum(longer * jnp.sqrt(BEND * aside / bend), shortest)
         ahead = road.spacing * jnp.arange(count - SPLICE)
         moved = quintic(before.move[:, SPLICE], end, length, ahead)[:3]
         move = jnp.concatenate([before.move[:, :SPLICE], moved], axis=1)
@@ -322,10 +352,14 @@ class Manoeuvres:
         return Committed(before.index, move, square)
 
 
-def _lengths(road: RoadAhead) -> tuple[Scalar, Scalar]:
+def _lengths(road: RoadAhead, shortest: float) -> tuple[Scalar, Scalar]:
     """Return the longest lateral move, and the middle of all lengths [m].
 
     Two of the longest moves fit into the road.
+
+    Args:
+        road: ahead of the car.
+        shortest: lateral move [m].
     """
     longest = 0.5 * road.spacing * (road.curvature.shape[0] - 1 - SPLICE)
-    return longest, 0.5 * (SHORTEST + longest)
+    return longest, 0.5 * (shortest + longest)
