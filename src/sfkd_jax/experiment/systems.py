@@ -251,7 +251,11 @@ class SystemRun:
             trained.model, trained.params, boxes.env, validation=dataset.validation
         )
         if not proof.outputs:
-            raise CertificationRefused("no metric of the outputs was found")
+            outputs = ", ".join(self.tracked.rows)
+            raise CertificationRefused(
+                f"no metric was found in which {outputs} contract: train longer "
+                "(tubes.steps), or take a larger tubes.rate"
+            )
         proved = time.perf_counter() - began
         measured = measure(
             trained.model,
