@@ -1,0 +1,139 @@
+"""Branch and bound: a cover on whose leaves a bound holds. Nothing here is trusted."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from sfkd_jax.enclosures._covers import (
+    LEAF,
+    OUTSIDE,
+    Boxes,
+    Question,
+    in_parts,
+    whole,
+)
+
+AHEAD = 3
+"""Halvings that are chosen at once, since a choice costs as much as `variables` bounds.
+"""
+FALL = 0.25
+"""What is left of the gain of a halving after the halving: bounds are of second order.
+"""
+
+
+class Found(NamedTuple):
+    """The result of a search.
+
+    Attributes:
+        codes: of the cover; where the search ended early, open boxes are leaves.
+        open: boxes on which the bound is not proved.
+        largest: the largest bound of a leaf, open ones included.
+        leaves: number of leaves.
+        seconds: that the search took [s].
+    """
+
+    codes: UInt8[np.ndarray, " node"]
+    open: Boxes
+    largest: float
+    leaves: int
+    seconds: float
+
+
+def search_cover(
+    question: Question,
+    target: float,
+    *,
+    most: int = 10_000_000,
+    seconds: float = np.inf,
+    told: Callable[[str], None] | None = None,
+) -> Found:
+    """Return a cover on whose leaves the number is at most `target`.
+
+    Args:
+        question: what is bounded.
+        target: bound that leaves must reach.
+        most: boxes of a level, beyond which the search ends.
+        seconds: after which it ends at the next level [s].
+        told: is given a line of progress on each level.
+    """
+    began = time.perf_counter()
+    boxes = whole(question.roots, question.variables)
+    planned = np.full((boxes.count, AHEAD), -1)
+    codes = []
+    leaves = 0
+    largest = 0.0
+    while True:
+        outside = question.outside(boxes)
+        bounds = np.zeros(boxes.count)
+        bounds[~outside] = in_parts(question.bound, boxes[~outside])
+        is_open = ~(bounds <= target)
+        ends = boxes.count > most or time.perf_counter() - began > seconds
+        level = np.full(boxes.count, LEAF, np.uint8)
+        level[outside] = OUTSIDE
+        leaves += int(np.sum(~is_open & ~outside))
+        largest = max(largest, float(np.max(bounds[~is_open], initial=0.0)))
+        if told is not None:
+            told(f"level {len(codes)}: {boxes.count} boxes, {np.sum(is_open)} open")
+        if ends or not np.any(is_open):
+            codes.append(level)
+            worst = float(np.max(bounds, initial=0.0))
+            return Found(
+                codes=np.concatenate(codes),
+                open=boxes[is_open],
+                largest=max(largest, worst),
+                leaves=leaves + int(np.sum(is_open)),
+                seconds=time.perf_counter() - began,
+            )
+        rest = boxes[is_open]
+        plan = _planned(question, rest, planned[is_open])
+        level[is_open] = plan[:, 0]
+        codes.append(level)
+        boxes = rest.halved(plan[:, 0])
+        planned = np.roll(plan, -1, axis=1)
+        planned[:, -1] = -1
+        planned = planned.repeat(2, axis=0)
+
+
+def _remainders(question: Question, boxes: Boxes) -> Float[np.ndarray, " box"]:
+    """Return the sizes of what is not linear on each box."""
+
+    def of_part(part: Boxes) -> np.ndarray:
+        error = question.enclose(part).error
+        return np.broadcast_to(np.linalg.norm(error, axis=-1), part.count)
+
+    return in_parts(of_part, boxes)
+
+
+def _planned(
+    question: Question, boxes: Boxes, planned: Int[np.ndarray, "box ahead"]
+) -> Int[np.ndarray, "box ahead"]:
+    """Return the variables of the next halvings of each box, where none are planned.
+
+    They are those that make the remainder smaller. Halving what is linear would give
+    smaller bounds at the centre of the box, and the same at its corners.
+    """
+    new = planned[:, 0] < 0
+    if not np.any(new):
+        return planned
+    fresh = boxes[new]
+    before = _remainders(question, fresh)
+    gains = np.empty((fresh.count, question.variables))
+    for index in range(question.variables):
+        radii = fresh.radii.copy()
+        radii[:, index] *= 0.5
+        gains[:, index] = before - _remainders(question, fresh._replace(radii=radii))
+    # Where nothing is finite, the widest variable comes first.
+    gains = np.where(np.isfinite(gains), gains, 1e300 * fresh.radii)
+    chosen = np.empty((fresh.count, AHEAD), int)
+    rows = np.arange(fresh.count)
+    for step in range(AHEAD):
+        chosen[:, step] = np.argmax(gains, axis=1)
+        gains[rows, chosen[:, step]] *= FALL
+    planned = planned.copy()
+    planned[new] = chosen
+    return planned
