@@ -200,4 +200,3 @@ def in_parts(evaluate: Callable[[Boxes], Bounds], boxes: Boxes) -> Bounds:
         for first in range(0, boxes.count, AT_ONCE)
     ]
     return np.concatenate(parts) if parts else np.zeros(0)
-

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from jaxtyping import Bool
 
 from sfkd_jax.enclosures._forms import (
     MARGIN,
@@ -81,7 +82,9 @@ def applied(curve: Curve, form: Form) -> Form:
             parts[row] += half * product
     parts[0] = value + shift
     error = np.abs(slope) * form.error + rest
-    error = error + 4.0 * LIBRARY * (np.abs(value) + (np.abs(slope) + 1.0) * form.radius)
+    error = error + 4.0 * LIBRARY * (
+        np.abs(value) + (np.abs(slope) + 1.0) * form.radius
+    )
     if curve.span is not None:
         bottom, top = curve.span(low, high)
         half = 0.5 * (top - bottom) + 8.0 * LIBRARY * np.maximum(abs(top), abs(bottom))
@@ -109,28 +112,39 @@ def _third_order(curve: Curve, form: Form, kept: Pairs, third: Array) -> Array:
 def softmax(form: Form) -> Form:
     """Return softmax of a vector, from its second derivative along a segment.
 
-    Along x + t v it is w_i ((v_i - v̄)² - Var v) for weights w of the segment; with D
-    the largest difference of two entries of v, it is in w_i [-D²/4, D²], and w_i is at
-    most its value at the centre times e^D.
+    Along x + t v it is w_i ((v_i - v̄)² - Var v), for weights w somewhere on the segment
+    and v̄ = Σ w_j v_j. With D_ij a bound of |v_i - v_j| and w_j ≤ h_j,
+
+        w_i ≤ h_i = 1 / Σ_j exp(x_j - x_i - D_ij),
+        |v_i - v̄| ≤ Σ_j h_j D_ij,   Var v ≤ Σ_j h_j D_jk² for every k.
     """
     form = form.linear
-    top = form.centre.max(axis=1, keepdims=True)
-    raised = np.exp(form.centre - top)
+    centre = form.centre
+    top = centre.max(axis=1, keepdims=True)
+    raised = np.exp(centre - top)
     weights = raised / raised.sum(axis=1, keepdims=True)
     apart = np.abs(form.slopes[..., :, None] - form.slopes[..., None, :]).sum(axis=0)
     apart = apart + form.error[:, :, None] + form.error[:, None, :]
-    largest = apart.max(axis=(1, 2))[:, None] * (1.0 + 2.0 * MARGIN)
-    bent = 0.5 * weights * np.exp(largest) * largest**2
+    apart = apart * (1.0 + MARGIN) + 8.0 * UNIT * form.size.max(axis=1)[:, None, None]
+    below = np.exp(centre[:, None, :] - centre[:, :, None] - apart).sum(axis=2)
+    # x_i - x_i is 0 and not within D_ii.
+    own = np.exp(-np.diagonal(apart, axis1=1, axis2=2))
+    highest = np.minimum(1.0 / (below - own + 1.0), 1.0) * (1.0 + MARGIN)
+    off = np.einsum("bj,bij->bi", highest, apart)
+    off = np.minimum(off, apart.max(axis=2)) * (1.0 + MARGIN)
+    variance = np.einsum("bj,bjk->bk", highest, apart**2).min(axis=1)[:, None]
+    above = 0.5 * highest * off**2 * (1.0 + MARGIN)
+    under = 0.5 * highest * variance * (1.0 + MARGIN)
     mean = np.sum(weights * form.parts, axis=-1, keepdims=True)
     parts = weights * (form.parts - mean)
     spread = np.sum(weights * form.error, axis=1, keepdims=True)
-    error = weights * (form.error + spread) + 0.625 * bent
-    parts[0] = weights + 0.375 * bent
-    # All weights are in [0, 1].
-    wide = ~(np.abs(parts[1:]).sum(axis=0) + error <= 0.5)
+    error = weights * (form.error + spread) + 0.5 * (above + under)
+    parts[0] = weights + 0.5 * (above - under)
+    # All weights are between 0 and h.
+    wide = ~(2.0 * (np.abs(parts[1:]).sum(axis=0) + error) <= highest)
     parts = np.where(wide, 0.0, parts)
-    parts[0] = np.where(wide, 0.5, parts[0])
-    error = np.where(wide, 0.5, error) + SLACK * (1.0 + 8.0 * form.size)
+    parts[0] = np.where(wide, 0.5 * highest, parts[0])
+    error = np.where(wide, 0.5 * highest, error) + SLACK * (1.0 + 8.0 * form.size)
     return rounded(form.of(parts, error), 4.0 * (1.0 + form.size), 64)
 
 
@@ -177,7 +191,7 @@ def _exp_curvature(low: Array, high: Array) -> tuple[Array, Array]:
     return np.exp(low) * (1.0 - MARGIN), np.exp(high) * (1.0 + MARGIN)
 
 
-def _crosses(low: Array, high: Array) -> Array:
+def _crosses(low: Array, high: Array) -> Bool[np.ndarray, "..."]:
     """Return whether 0 may be in an interval."""
     return ~((low > 0.0) | (high < 0.0))
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from typing import TypeAlias
 
 import numpy as np
@@ -92,7 +93,8 @@ class Form:
         """Bounds of the values."""
         linear = self.linear
         radius = linear.radius + 4.0 * UNIT * linear.size
-        return linear.centre - radius, linear.centre + radius
+        with np.errstate(invalid="ignore"):
+            return linear.centre - radius, linear.centre + radius
 
     @cached_property
     def linear(self) -> Form:
@@ -182,6 +184,17 @@ def aligned(form: Form, active: tuple[int, ...], pairs: Pairs) -> Form:
     rows += [1 + len(active) + pairs.index(pair) for pair in form.pairs]
     parts[[0, *rows]] = form.parts
     return Form(parts, active, pairs, form.curved, form.error)
+
+
+def pruned(form: Form) -> Form:
+    """Return a form without the variables and pairs whose parts are all 0."""
+    has = [bool(np.any(part)) for part in form.parts[1:]]
+    if all(has):
+        return form
+    count = len(form.active)
+    active = tuple(compress(form.active, has[:count]))
+    pairs = tuple(compress(form.pairs, has[count:]))
+    return Form(form.parts[[True, *has]], active, pairs, form.curved, form.error)
 
 
 def union(forms: Iterable[Form]) -> tuple[tuple[int, ...], Pairs, frozenset[int]]:

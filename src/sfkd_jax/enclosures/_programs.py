@@ -24,6 +24,7 @@ from sfkd_jax.enclosures._forms import (
     larger,
     multiply,
     negative,
+    pruned,
     total,
     union,
     weighted,
@@ -35,6 +36,8 @@ MOVES = frozenset(
     "convert_element_type".split()
 )
 """Primitives that only move entries."""
+FEW = 16
+"""Entries of a move, up to which variables without influence are looked for."""
 CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "remat2")
 
 
@@ -342,7 +345,8 @@ def _alike(left: Form, right: Form) -> tuple[Form, Form]:
 def _evaluated(operation: Operation, operands: list[Any]) -> Form:
     """Evaluate one operation."""
     if operation.moved is not None:
-        return _move_forms([_as_form(value) for value in operands], operation.moved)
+        moved = _move_forms([_as_form(value) for value in operands], operation.moved)
+        return pruned(moved) if moved.error[0].size <= FEW else moved
     if operation.name == "dot_general":
         return _dot(operands, operation.params["dimension_numbers"])
     forms = [_as_form(value) for value in operands]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +48,8 @@ def search_cover(
     question: Question,
     target: float,
     *,
+    along: Sequence[int] = (),
+    first: Sequence[int] = (),
     most: int = 10_000_000,
     seconds: float = np.inf,
     told: Callable[[str], None] | None = None,
@@ -57,14 +59,22 @@ def search_cover(
     Args:
         question: what is bounded.
         target: bound that leaves must reach.
+        along: variables that are halved; () for all.
+        first: variables along which all boxes are halved first, without bounds.
         most: boxes of a level, beyond which the search ends.
         seconds: after which it ends at the next level [s].
         told: is given a line of progress on each level.
     """
     began = time.perf_counter()
     boxes = whole(question.roots, question.variables)
-    planned = np.full((boxes.count, AHEAD), -1)
     codes = []
+    for index in first:
+        codes.append(np.full(boxes.count, index, np.uint8))
+        boxes = boxes.halved(np.full(boxes.count, index))
+    # Boxes of one family share the choice of their next halvings.
+    families = boxes.roots
+    planned = np.full((boxes.count, AHEAD), -1)
+    along = along or range(question.variables)
     leaves = 0
     largest = 0.0
     while True:
@@ -90,13 +100,22 @@ def search_cover(
                 seconds=time.perf_counter() - began,
             )
         rest = boxes[is_open]
-        plan = _planned(question, rest, planned[is_open])
+        plan = planned[is_open]
+        families = families[is_open]
+        new = plan[:, 0] < 0
+        if np.any(new):
+            _, one, of = np.unique(
+                families[new], return_index=True, return_inverse=True
+            )
+            plan[new] = _planned(question, rest[new][one], along)[of]
+            families = np.where(new, np.arange(rest.count), families)
         level[is_open] = plan[:, 0]
         codes.append(level)
         boxes = rest.halved(plan[:, 0])
         planned = np.roll(plan, -1, axis=1)
         planned[:, -1] = -1
         planned = planned.repeat(2, axis=0)
+        families = families.repeat(2)
 
 
 def _remainders(question: Question, boxes: Boxes) -> Float[np.ndarray, " box"]:
@@ -110,30 +129,25 @@ def _remainders(question: Question, boxes: Boxes) -> Float[np.ndarray, " box"]:
 
 
 def _planned(
-    question: Question, boxes: Boxes, planned: Int[np.ndarray, "box ahead"]
+    question: Question, boxes: Boxes, along: Sequence[int]
 ) -> Int[np.ndarray, "box ahead"]:
-    """Return the variables of the next halvings of each box, where none are planned.
+    """Return the variables of the next halvings of each box.
 
     They are those that make the remainder smaller. Halving what is linear would give
     smaller bounds at the centre of the box, and the same at its corners.
     """
-    new = planned[:, 0] < 0
-    if not np.any(new):
-        return planned
-    fresh = boxes[new]
-    before = _remainders(question, fresh)
-    gains = np.empty((fresh.count, question.variables))
-    for index in range(question.variables):
-        radii = fresh.radii.copy()
+    before = _remainders(question, boxes)
+    gains = np.full((boxes.count, question.variables), -np.inf)
+    for index in along:
+        radii = boxes.radii.copy()
         radii[:, index] *= 0.5
-        gains[:, index] = before - _remainders(question, fresh._replace(radii=radii))
+        gains[:, index] = before - _remainders(question, boxes._replace(radii=radii))
     # Where nothing is finite, the widest variable comes first.
-    gains = np.where(np.isfinite(gains), gains, 1e300 * fresh.radii)
-    chosen = np.empty((fresh.count, AHEAD), int)
-    rows = np.arange(fresh.count)
+    may = np.isin(np.arange(question.variables), along)
+    gains = np.where(may & ~np.isfinite(gains), 1e300 * boxes.radii, gains)
+    chosen = np.empty((boxes.count, AHEAD), int)
+    rows = np.arange(boxes.count)
     for step in range(AHEAD):
         chosen[:, step] = np.argmax(gains, axis=1)
         gains[rows, chosen[:, step]] *= FALL
-    planned = planned.copy()
-    planned[new] = chosen
-    return planned
+    return chosen

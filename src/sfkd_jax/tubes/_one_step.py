@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float
 
 from sfkd_jax import enclosures
 from sfkd_jax.enclosures import Boxes, Form, Question
-from sfkd_jax.rollout import unfold
 from sfkd_jax.systems import ClosedLoop, SteadyState
 from sfkd_jax.types import BODY, Model, Params
 
@@ -222,6 +221,3 @@ def _between(table: Array, place: Array) -> Array:
         middle = 0.5 * (table[0] + table[1])
         table = middle + share * (0.5 * (table[1] - table[0]))
     return table
-
-
-__all__ = ["Cells", "OneStep", "States", "cells_of", "unfold"]
