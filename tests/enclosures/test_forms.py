@@ -116,6 +116,15 @@ def test_products_of_curved_variables_leave_a_remainder_of_third_order():
     assert with_pairs == pytest.approx(8.0, rel=0.02)
 
 
+def test_a_square_at_its_lowest_point_is_no_constant():
+    """Its slope is 0 there, so that only the pair of its variable is left."""
+    read = program(lambda x: (x**2)[:1] * x[1:] + (x**2)[:1], np.zeros(2))
+    centres = np.asarray([[0.0, 1.0]])
+    low, high = read(variables(centres, np.ones((1, 2)), (0, 1)))[0].range
+    assert low <= 0.0
+    assert high >= 3.0
+
+
 def test_common_terms_cancel():
     def program_of(x):
         return (MATRIX @ x) * 2.0 - MATRIX @ (2.0 * x)

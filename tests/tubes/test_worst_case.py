@@ -25,6 +25,7 @@ from sfkd_jax.tubes._one_step import Cells
 from sfkd_jax.types import BODY
 
 NOISE = np.asarray([0.003, 0.006])
+FACTOR = 1.01
 METRIC = ((1.0, 0.1), (0.1, 0.2))
 B = np.asarray([0.5 * DT**2, DT])
 
@@ -46,7 +47,7 @@ def one_step(of=None):
     of = loop() if of is None else of
     model = models.physics(nominal_step, frame=of.tracked.model_frame)
     states = States(np.zeros(2), np.diag([0.05, 0.1]), np.zeros((0, 2)))
-    return OneStep(of, model, {}, states, NOISE)
+    return OneStep(of, model, {}, states, NOISE, curved=(0, 1, 2, 3, 4))
 
 
 def claim():
@@ -80,12 +81,12 @@ def largest():
 
 @cache
 def proved():
-    return prove_worst_case(one_step(), claim(), largest(), factor=1.002)
+    return prove_worst_case(one_step(), claim(), largest(), factor=FACTOR)
 
 
 def test_the_bound_is_the_known_one():
     tube, _ = proved()
-    assert largest() * (1.0 - 1e-12) <= tube.one_step <= 1.002 * largest()
+    assert largest() * (1.0 - 1e-12) <= tube.one_step <= FACTOR * largest()
     assert tube.radius == pytest.approx(tube.one_step / (1.0 - claim().alpha))
 
 
@@ -128,10 +129,10 @@ def test_the_tube_holds_on_the_worst_sequences_that_a_greedy_enemy_finds(key):
     state = jnp.zeros(2)
     nominal = jnp.zeros(2)
     farthest = 0.0
-    for _ in range(15):
+    for _ in range(30):
         options = [
             over(state, nominal, corners, *(part[number] for part in error.cells))
-            for number in (0, len(error.cells.middle) - 1)
+            for number in range(len(error.cells.middle))
         ]
         states, nominals = (np.concatenate(part) for part in zip(*options, strict=True))
         gaps = np.linalg.norm((states - nominals) @ root.T, axis=1)
@@ -140,7 +141,7 @@ def test_the_tube_holds_on_the_worst_sequences_that_a_greedy_enemy_finds(key):
         state = states[best]
         nominal = nominals[best]
         farthest = max(farthest, float(gaps[best]))
-    assert 0.3 * tube.radius < farthest <= tube.radius
+    assert 0.15 * tube.radius < farthest <= tube.radius
 
 
 def heavier(state, control, env):

@@ -13,7 +13,7 @@ from sfkd_jax.enclosures._forms import constant as constant
 from sfkd_jax.enclosures._forms import of_boxes as of_boxes
 from sfkd_jax.enclosures._forms import variables as variables
 from sfkd_jax.enclosures._programs import Program as Program
-from sfkd_jax.enclosures._programs import UnknownPrimitive as UnknownPrimitive
 from sfkd_jax.enclosures._programs import program as program
+from sfkd_jax.enclosures._reading import UnknownPrimitive as UnknownPrimitive
 from sfkd_jax.enclosures._search import Found as Found
 from sfkd_jax.enclosures._search import search_cover as search_cover

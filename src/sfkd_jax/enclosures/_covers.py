@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -39,7 +39,7 @@ class Boxes(NamedTuple):
     centres: Float[np.ndarray, "box variable"]
     radii: Float[np.ndarray, "box variable"]
 
-    def __getitem__(self, index: object) -> Boxes:  # type: ignore[override]
+    def some(self, index: Any) -> Boxes:
         """Return some of the boxes."""
         return Boxes(*(part[index] for part in (self.roots, self.centres, self.radii)))
 
@@ -124,12 +124,12 @@ def check_cover(
     for leaves, outside in levels(codes, question):
         count += leaves.count
         if share < 1.0:
-            leaves = leaves[random.random(leaves.count) < share]
-            outside = outside[random.random(outside.count) < share]
+            leaves = leaves.some(random.random(leaves.count) < share)
+            outside = outside.some(random.random(outside.count) < share)
         if outside.count and not np.all(question.outside(outside)):
             raise CoverRefused("a box is left out that is not outside of the domain")
         for first in range(0, leaves.count, AT_ONCE):
-            part = leaves[slice(first, first + AT_ONCE)]
+            part = leaves.some(slice(first, first + AT_ONCE))
             # A bound that is NaN is none.
             fails = ~(question.bound(part) <= largest)
             if np.any(fails):
@@ -164,8 +164,8 @@ def levels(
         is_split = level < question.variables
         if not np.all(is_leaf | is_outside | is_split):
             raise CoverRefused("a code is no variable")
-        yield boxes[is_leaf], boxes[is_outside]
-        boxes = boxes[is_split].halved(level[is_split].astype(int))
+        yield boxes.some(is_leaf), boxes.some(is_outside)
+        boxes = boxes.some(is_split).halved(level[is_split].astype(int))
     if first != len(codes):
         raise CoverRefused("there are codes beyond the last box")
 
@@ -196,7 +196,7 @@ def largest_entries(form: Form) -> Bounds:
 def in_parts(evaluate: Callable[[Boxes], Bounds], boxes: Boxes) -> Bounds:
     """Return the values of many boxes, some at once."""
     parts = [
-        evaluate(boxes[slice(first, first + AT_ONCE)])
+        evaluate(boxes.some(slice(first, first + AT_ONCE)))
         for first in range(0, boxes.count, AT_ONCE)
     ]
     return np.concatenate(parts) if parts else np.zeros(0)

@@ -191,7 +191,7 @@ def _exp_curvature(low: Array, high: Array) -> tuple[Array, Array]:
     return np.exp(low) * (1.0 - MARGIN), np.exp(high) * (1.0 + MARGIN)
 
 
-def _crosses(low: Array, high: Array) -> Bool[np.ndarray, "..."]:
+def _crosses(low: Array, high: Array) -> Bool[np.ndarray, ...]:
     """Return whether 0 may be in an interval."""
     return ~((low > 0.0) | (high < 0.0))
 

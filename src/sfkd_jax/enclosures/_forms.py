@@ -8,8 +8,8 @@ A form encloses a function of the variables of a box, x_j = centre_j + radius_j 
 where i and j are among the `curved` variables. Common terms of two forms cancel in
 their difference. The remainder is of third order in the radii of curved variables, and
 of second order in others. Sources: de Figueiredo and Stolfi, Affine arithmetic:
-concepts and applications, Numerical Algorithms 37 (2004); Makino and Berz, Taylor models
-and other validated functional inclusion methods, 2003.
+concepts and applications, Numerical Algorithms 37 (2004); Makino and Berz, Taylor
+models and other validated functional inclusion methods, 2003.
 
 Everything is computed in float64, rounded to nearest. Each operation adds to r what
 rounding may have changed: of a sum of n products at most γ_n times the sum of their
@@ -187,11 +187,17 @@ def aligned(form: Form, active: tuple[int, ...], pairs: Pairs) -> Form:
 
 
 def pruned(form: Form) -> Form:
-    """Return a form without the variables and pairs whose parts are all 0."""
+    """Return a form without the variables and pairs whose parts are all 0.
+
+    A variable of a pair stays: a form without active variables is a constant.
+    """
+    count = len(form.active)
     has = [bool(np.any(part)) for part in form.parts[1:]]
+    of_pairs = {index for pair in compress(form.pairs, has[count:]) for index in pair}
+    for row, index in enumerate(form.active):
+        has[row] |= index in of_pairs
     if all(has):
         return form
-    count = len(form.active)
     active = tuple(compress(form.active, has[:count]))
     pairs = tuple(compress(form.pairs, has[count:]))
     return Form(form.parts[[True, *has]], active, pairs, form.curved, form.error)

@@ -80,7 +80,7 @@ def search_cover(
     while True:
         outside = question.outside(boxes)
         bounds = np.zeros(boxes.count)
-        bounds[~outside] = in_parts(question.bound, boxes[~outside])
+        bounds[~outside] = in_parts(question.bound, boxes.some(~outside))
         is_open = ~(bounds <= target)
         ends = boxes.count > most or time.perf_counter() - began > seconds
         level = np.full(boxes.count, LEAF, np.uint8)
@@ -94,21 +94,14 @@ def search_cover(
             worst = float(np.max(bounds, initial=0.0))
             return Found(
                 codes=np.concatenate(codes),
-                open=boxes[is_open],
+                open=boxes.some(is_open),
                 largest=max(largest, worst),
                 leaves=leaves + int(np.sum(is_open)),
                 seconds=time.perf_counter() - began,
             )
-        rest = boxes[is_open]
+        rest = boxes.some(is_open)
         plan = planned[is_open]
-        families = families[is_open]
-        new = plan[:, 0] < 0
-        if np.any(new):
-            _, one, of = np.unique(
-                families[new], return_index=True, return_inverse=True
-            )
-            plan[new] = _planned(question, rest[new][one], along)[of]
-            families = np.where(new, np.arange(rest.count), families)
+        families = _plan_families(question, rest, plan, families[is_open], along)
         level[is_open] = plan[:, 0]
         codes.append(level)
         boxes = rest.halved(plan[:, 0])
@@ -116,6 +109,25 @@ def search_cover(
         planned[:, -1] = -1
         planned = planned.repeat(2, axis=0)
         families = families.repeat(2)
+
+
+def _plan_families(
+    question: Question,
+    boxes: Boxes,
+    plan: Int[np.ndarray, "box ahead"],
+    families: Int[np.ndarray, " box"],
+    along: Sequence[int],
+) -> Int[np.ndarray, " box"]:
+    """Fill in the plans of boxes that have none, and return their families.
+
+    One box is asked for all of a family; then each of them is a family of its own.
+    """
+    new = plan[:, 0] < 0
+    if not np.any(new):
+        return families
+    _, one, of = np.unique(families[new], return_index=True, return_inverse=True)
+    plan[new] = _planned(question, boxes.some(new).some(one), along)[of]
+    return np.where(new, np.arange(boxes.count), families)
 
 
 def _remainders(question: Question, boxes: Boxes) -> Float[np.ndarray, " box"]:

@@ -1,6 +1,6 @@
 """The one-step error of a model of a closed loop, as a program over cells of its law.
 
-    d(ξ, n, ν, ρ, e) = F(encode ξ; ν, ρ, e) - encode f(ξ, clip(law(ξ + n; ρ, e) + ν), ρ, e)
+    d = F(encode ξ; ν, ρ, e) - encode f(ξ, clip(law(ξ + n; ρ, e) + ν), ρ, e)
 
 A cell is a box of the table of the law, inside of which the law is a polynomial. The
 variables of a cell are in [-1, 1]: (ρ, e), then y with ξ = middle + basis y, then ν
@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +22,9 @@ from sfkd_jax import enclosures
 from sfkd_jax.enclosures import Boxes, Form, Question
 from sfkd_jax.systems import ClosedLoop, SteadyState
 from sfkd_jax.types import BODY, Model, Params
+
+Table: TypeAlias = Any
+"""Arrays of numpy, and of jax inside of a program."""
 
 
 class Cells(NamedTuple):
@@ -35,11 +38,11 @@ class Cells(NamedTuple):
         gain: K at the corners, (cell, 2, …, 2, control, state).
     """
 
-    middle: Float[np.ndarray, "cell axis"]
-    half: Float[np.ndarray, "cell axis"]
-    state: Float[np.ndarray, "cell ..."]
-    control: Float[np.ndarray, "cell ..."]
-    gain: Float[np.ndarray, "cell ..."]
+    middle: Table
+    half: Table
+    state: Table
+    control: Table
+    gain: Table
 
 
 class States(NamedTuple):
@@ -66,8 +69,8 @@ def cells_of(law: Any) -> Cells:
     places = [*product(*(range(count - 1) for count in counts))]
 
     def corners_of(table: Array) -> np.ndarray:
-        table = np.asarray(table, np.float64)
-        parts = [table[tuple(slice(i, i + 2) for i in place)] for place in places]
+        values = np.asarray(table, np.float64)
+        parts = [values[tuple(slice(i, i + 2) for i in place)] for place in places]
         return np.stack(parts)
 
     half = np.broadcast_to(0.5 * width, (len(places), axes))
@@ -123,7 +126,7 @@ class OneStep:
     def situation(
         self, at: Array, cell: Cells
     ) -> tuple[Array, Array, Array, Array, Array, SteadyState]:
-        """Return ξ, n, ν, ρ and e of variables of a cell, and what the law has there."""
+        """Return ξ, n, ν, ρ and e of variables of a cell, and what the law has."""
         place, y, nu, noise = self.parts(at)
         steady = SteadyState(
             state=_between(cell.state, place),
@@ -212,7 +215,7 @@ def _padded(error: Array) -> Array:
     return jnp.concatenate([jnp.zeros(BODY.start), error])
 
 
-def _between(table: Array, place: Array) -> Array:
+def _between(table: Table, place: Array) -> Array:
     """Interpolate the values at the corners of a cell, at a place in [-1, 1].
 
     One axis at a time, so that an enclosure is of differences of the corners.

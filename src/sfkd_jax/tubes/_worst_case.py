@@ -4,11 +4,14 @@
     ⟹  |z - ẑ|_P ≤ R = d_0 / (1 - α),   |y - ŷ| ≤ L R
 
 The latent ẑ of the nominal model F, which is driven with the same ν, ρ and e, contracts
-at the proved rate α: |z⁺ - ẑ⁺| ≤ |F(z) - F(ẑ)| + |d| ≤ α |z - ẑ| + d_0. So a distance of
-R at most stays so for every sequence of references, environments, planners and sensor
-errors of the domain, for as long as the states of the system stay in it. This is about
-the programs as functions of real numbers; the rounding of a step in float32 is no part
-of it.
+at the proved rate α:
+
+    |z⁺ - ẑ⁺| ≤ |F(z) - F(ẑ)| + |d| ≤ α |z - ẑ| + d_0
+
+So a distance of R at most stays so for every sequence of references, environments,
+planners and sensor errors of the domain, for as long as the states of the system stay
+in it. This is about the programs as functions of real numbers; the rounding of a step
+in float32 is no part of it.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ STARTS = 256
 """Points from which the sampled error is driven uphill."""
 CLIMB = 150
 """Steps uphill."""
+ROOM = 1.0 + 1e-9
+"""For the rounding of the ends of cells, between which slivers of 1e-16 may be left."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,9 +153,10 @@ def prove_worst_case(
             f"{factor:g} times the largest sampled error; the largest bound is "
             f"{found.largest:.4g}"
         )
-    radius = found.largest / (1.0 - claim.alpha)
+    largest = found.largest * ROOM
+    radius = largest / (1.0 - claim.alpha)
     tube = WorstCase(
-        one_step=found.largest,
+        one_step=largest,
         radius=radius,
         bound=claim.lipschitz * radius,
         sampled=sampled,
@@ -183,15 +189,14 @@ def check_worst_case(
         CoverRefused: the cover does not prove d_0.
     """
     radius = tube.one_step / (1.0 - claim.alpha)
-    room = 1.0 + 1e-9
     if hash_of(codes) != tube.leaves_sha256:
         raise WorstCaseRefused("the leaves are not those of the tube")
-    if not (claim.alpha < 1.0 and radius <= tube.radius * room):
+    if not (claim.alpha < 1.0 and radius <= tube.radius * ROOM):
         raise WorstCaseRefused("the radius does not follow from one_step and alpha")
-    if not claim.lipschitz * tube.radius <= tube.bound * room:
+    if not claim.lipschitz * tube.radius <= tube.bound * ROOM:
         raise WorstCaseRefused("the bound does not follow from the radius")
     question = error.error_in(np.asarray(claim.metric))
-    leaves = check_cover(question, codes, tube.one_step, share=share)
+    leaves = check_cover(question, codes, tube.one_step / ROOM, share=share)
     if leaves != tube.leaves:
         raise WorstCaseRefused("the number of leaves is another")
 
