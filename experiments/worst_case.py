@@ -1,14 +1,16 @@
 """The tube of the worst case of a certified system: proved, or checked.
 
     python -m experiments.worst_case RUN SYSTEM [--out DIR] [--factor 2] [--seconds 600]
-        [--size 1]
+        [--size 1] [--first VARIABLE ...]
     python -m experiments.worst_case RUN SYSTEM [--out DIR] [--size 1] --check
         [--share 1]
 
 RUN is the run directory of a system of examples/systems, such as SYSTEM = motor. States
 are those of the box in which its shield makes claims, or of a smaller box of --size
-times its widths around its middle; sensors are within three standard deviations. A line of JSON for each output is printed, and kept in DIR beside the leaves
-that prove it: OUTPUT.worst_case.json and OUTPUT.worst_case.npz.
+times its widths around its middle; sensors are within three standard deviations. Every
+cell is halved along the variables of --first before a bound is asked for. A line of
+JSON for each output is printed, and kept in DIR beside the leaves that prove it:
+OUTPUT.worst_case.json and OUTPUT.worst_case.npz.
 """
 
 import argparse
@@ -73,6 +75,7 @@ def main():
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--factor", type=float, default=2.0)
     parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--first", type=int, nargs="*", default=())
     parser.add_argument("--size", type=float, default=1.0)
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--share", type=float, default=1.0)
@@ -99,6 +102,7 @@ def main():
             sampled,
             factor=given.factor,
             seconds=given.seconds,
+            first=tuple(given.first),
             told=lambda line: print(line, flush=True),
         )
         out.mkdir(parents=True, exist_ok=True)

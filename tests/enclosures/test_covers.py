@@ -1,5 +1,7 @@
 """A cover proves what it says, and a forged one is refused."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -38,6 +40,21 @@ def test_a_known_largest_value_is_enclosed_from_above(found):
     assert not found.open.count
     assert 2.0 <= found.largest <= 2.02
     assert check_cover(question(), found.codes, found.largest) == found.leaves
+
+
+def test_boxes_outside_of_the_domain_are_left_out():
+    """For |x| ≤ 1/2 the largest |z²| is 5/4."""
+
+    def outside(boxes):
+        return np.abs(boxes.centres[:, 0]) - boxes.radii[:, 0] > 0.5
+
+    narrow = replace(question(), outside=outside)
+    cover = search_cover(narrow, 1.27)
+    assert not cover.open.count
+    assert np.any(cover.codes == 254)
+    assert check_cover(narrow, cover.codes, cover.largest) == cover.leaves
+    with pytest.raises(CoverRefused, match="left out"):
+        check_cover(question(), cover.codes, cover.largest)
 
 
 def test_no_search_closes_below_the_largest_value():

@@ -5,7 +5,6 @@ from sfkd_jax.enclosures._covers import CoverRefused as CoverRefused
 from sfkd_jax.enclosures._covers import Question as Question
 from sfkd_jax.enclosures._covers import check_cover as check_cover
 from sfkd_jax.enclosures._covers import in_parts as in_parts
-from sfkd_jax.enclosures._covers import largest_entries as largest_entries
 from sfkd_jax.enclosures._covers import levels as levels
 from sfkd_jax.enclosures._covers import norms as norms
 from sfkd_jax.enclosures._forms import Form as Form

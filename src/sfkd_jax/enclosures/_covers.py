@@ -188,11 +188,6 @@ def norms(form: Form) -> Bounds:
     return (largest + error + lost) * (1.0 + MARGIN)
 
 
-def largest_entries(form: Form) -> Bounds:
-    """Return bounds of the largest entry of vectors."""
-    return np.max(form.range[1], axis=-1)
-
-
 def in_parts(evaluate: Callable[[Boxes], Bounds], boxes: Boxes) -> Bounds:
     """Return the values of many boxes, some at once."""
     parts = [

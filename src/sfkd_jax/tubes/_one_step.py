@@ -165,19 +165,6 @@ class OneStep:
 
         return self._question(scaled, enclosures.norms)
 
-    def leaving(self) -> Question:
-        """Return the question of how far the states go, 1 where they stay."""
-        inverse = np.linalg.inv(self.states.basis)
-        faces = self.states.normals
-        box = np.eye(len(inverse))
-        normals = np.concatenate([faces, box, -box])
-
-        def reached(at: Array, cell: Cells) -> Array:
-            moved = self.after(at, cell) - jnp.asarray(self.states.middle)
-            return jnp.asarray(normals @ inverse) @ moved
-
-        return self._question(reached, enclosures.largest_entries)
-
     def _question(self, function: Any, measure: Any) -> Question:
         """Return the question of a function of variables and a cell."""
         cells = self.cells
