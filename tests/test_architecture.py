@@ -33,6 +33,7 @@ GROUND = {
     "settings": {"ranges"},
     "store": set(),
     "certificate": {"ranges", "store"},
+    "enclosures": set(),
     "models": CORE,
     "control": CORE,
     "progress": {"store"},
@@ -41,7 +42,7 @@ GROUND = {
     "evaluation": CORE,
     "certification": CORE | {"certificate", "data"},
     "systems": CORE | {"certificate", "control", "schedules", "tables"},
-    "tubes": CORE | {"certificate", "certification", "systems"},
+    "tubes": CORE | {"certificate", "certification", "enclosures", "systems"},
 }
 """The floor for any system with an environment: package -> what it may import."""
 ROAD = (
@@ -111,6 +112,7 @@ THIRD_PARTY = {
     "certificate": {"cryptography"},
     "certification": {"numpy", "scipy", "threadpoolctl", "cvxpy", "clarabel"},
     "evaluation": {"numpy", "scipy"},
+    "enclosures": {"numpy"},
     "systems": {"numpy", "cvxpy"},
     "tubes": {"numpy"},
     "driving.path_coordinates": {"numpy"},
