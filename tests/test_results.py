@@ -60,6 +60,22 @@ def test_what_the_page_of_systems_says_of_the_drone():
         assert said in words
 
 
+def test_what_the_page_of_systems_says_of_the_worst_case():
+    page = (results.HOME.parent / "docs" / "your-system.md").read_text("utf-8")
+    words = " ".join(page.split())
+    motor, cart = pages.read("experiments/worst_case.json")
+    lines = pages.read("experiments/systems.json")
+    tube = next(row for row in lines if row["system"] == "motor")["tube"]["speed"]
+    assert motor["options"] in words
+    assert f"with {motor['leaves']} leaves" in words
+    assert f"tube is {motor['bound']:.2f} rad/s" in words
+    # Eleven times.
+    assert round(motor["bound"] / tube) == 11
+    for row, factor in ((motor, 1.2), (cart, 2.0)):
+        assert row["one_step"] <= factor * row["sampled"] * (1.0 + 1e-6)
+    assert f"proved, a tube of {cart['bound']:.2f} m" in words
+
+
 @pytest.mark.parametrize("name", results.BENCHMARKS)
 def test_a_file_has_a_line_a_row_and_every_row_its_episodes(name):
     text = (results.HOME / f"{name}.json").read_text("utf-8")
