@@ -78,7 +78,9 @@ def test_the_largest_scale_whose_margin_is_positive_passes(seed):
             scale = control.FILTER_SCALES[passing[0]]
             expected = scale * clipped
             ways.add("request" if scale == 1.0 else "scaled" if scale else "law")
-            np.testing.assert_allclose(result.scale, scale)
+            # Of the entry of the request that the limit clips most.
+            share = np.min(LIMIT / np.maximum(np.abs(request), LIMIT))
+            np.testing.assert_allclose(result.scale, scale * share, rtol=1e-5)
         else:
             candidates = [np.zeros(2), *BACKUPS]
             best = [margin(A, B, start, nu, inputs) for nu in candidates]

@@ -14,6 +14,8 @@ from sfkd_jax.types import Control, Fiber, Latent, Model, Scalar
 
 FILTER_SCALES = (1.0, 0.875, 0.75, 0.625, 0.5, 0.375, 0.25, 0.125, 0.0)
 """Scales of a request that are tried, largest first; 0 is the law alone."""
+ROUNDING = 1e-5
+"""Share by which a request at its limit may exceed it."""
 Rows: TypeAlias = Sequence[int]
 """Entries of a state that are an output."""
 
@@ -81,7 +83,9 @@ def safety_filter(
     finite = jnp.where(all_finite(request), request, 0.0)
     clipped = jnp.clip(finite, -limit, limit)
     size = jnp.abs(finite)
-    share = jnp.min(jnp.where(size > limit, limit / size, 1.0))
+    # A planner at its limit asks for no more than that, but for rounding.
+    is_clipped = size > (1.0 + ROUNDING) * limit
+    share = jnp.min(jnp.where(is_clipped, limit / size, 1.0))
     # The candidates are the request at every scale and, with scale 0, the backups. The
     # law alone is the last of the scaled requests.
     zeros = (0.0,) * len(backups)
