@@ -97,8 +97,10 @@ def random_course(tracked, key, *, length):
     return Course(points, places[passed], passed[-1])
 
 
-def clearance(positions, windows, half):
-    """Smallest distance between the cage and a wall in a flight [m]; below 0 it hits.
+def clearances(positions, windows, half):
+    """Distance between the cage and the next wall in each step of a flight [m].
+
+    Below 0 it hits.
 
     Args:
         positions: of the drone, (time, 2).
@@ -107,9 +109,9 @@ def clearance(positions, windows, half):
     """
     share = np.linspace(0.0, 1.0, SUBSTEPS, endpoint=False)[:, None, None]
     between = positions[:-1] + share * np.diff(positions, axis=0)
-    away = between.reshape(-1, 1, 2) - windows
+    away = between[:, :, None] - windows
     beside = np.maximum(half - np.abs(away[..., 1]), 0.0)
-    return float(np.min(np.hypot(away[..., 0], beside)) - RADIUS)
+    return np.min(np.hypot(away[..., 0], beside), axis=(0, 2)) - RADIUS
 
 
 def flights(policy, system, *, runs):
@@ -160,7 +162,7 @@ def line_of(policy, courses, flown):
         positions = np.asarray(run.states)[..., :2]
         clear = np.array(
             [
-                clearance(path[: steps + 10], gaps, half)
+                clearances(path[: steps + 10], gaps, half).min()
                 for path, gaps, steps in zip(
                     positions, windows, np.asarray(courses.steps), strict=True
                 )
@@ -176,10 +178,16 @@ def line_of(policy, courses, flown):
     return line
 
 
-def flight_for_film(courses, scenes, flown):
+def flight_for_film(courses, scenes, flown, half):
     """Arrays of the flight in which the nominal planner is farthest off.
 
     The film ends soon after the last window.
+
+    Args:
+        courses: of `flights`, like the two that follow.
+        scenes: what is flown through.
+        flown: runs by controller.
+        half: of the opening of the windows [m].
     """
     number = int(np.argmax(np.max(flown["nominal"].errors, axis=(1, 2))))
     shown = slice(0, int(courses.steps[number]) + 10)
@@ -191,6 +199,10 @@ def flight_for_film(courses, scenes, flown):
     flight["reference"] = np.asarray(courses.points[number])
     flight["envs"] = np.asarray(scenes.envs[number, shown])
     flight["windows"] = np.asarray(courses.windows[number])
+    # Where the nominal drone stops, if it hits a wall.
+    gaps = clearances(flight["nominal"][:, :2], flight["windows"], half)
+    hits = np.flatnonzero(gaps <= 0.0)
+    flight["end"] = hits[0] if len(hits) else len(gaps)
     return flight
 
 
@@ -213,8 +225,8 @@ def main():
     if given.write:
         text = f"{json.dumps(line | stamp())}\n"
         HOME.joinpath("drone.json").write_text(text, "utf-8")
-        flight = flight_for_film(courses, scenes, flown)
         bound = line["bound_m"]
+        flight = flight_for_film(courses, scenes, flown, RADIUS + bound)
         pictures = DroneFilm(flight, dt=system.dt, radius=RADIUS, bound=bound)
         film.write(HOME.parent / "docs" / "drone.gif", pictures)
 

@@ -40,8 +40,7 @@ class DroneFilm:
         """Take what is drawn.
 
         Args:
-            flight: arrays by name: the states of "policy" and "nominal", the
-                "reference", "envs" and "windows", each as in `drone.flights`.
+            flight: of `drone.flight_for_film`.
             dt: sampling period [s].
             radius: of the cage [m].
             bound: of the position [m], certified.
@@ -53,7 +52,6 @@ class DroneFilm:
         self.places = flight["reference"][:, [0, 2]]
         padded = np.pad(self.places[:, 1], SMOOTH // 2, mode="edge")
         self.heights = np.convolve(padded, np.ones(SMOOTH) / SMOOTH, "valid")
-        self.crashed = None
 
     def frames(self):
         """Yield the frames."""
@@ -91,10 +89,8 @@ class DroneFilm:
             for side in (1.0, -1.0):
                 wall = [window[0]] * 2, [window[1] + side * half, side * 20.0]
                 draw_once(axes, Line2D(*wall, **WALL))
-        if self.crashed is None and self._hits(step, half):
-            self.crashed = step
-        last = step if self.crashed is None else self.crashed
-        self._draw_drone(axes, "nominal", last, centre, NOMINAL)
+        end = self.flight["end"]
+        self._draw_drone(axes, "nominal", min(step, end), centre, NOMINAL)
         self._draw_drone(axes, "policy", step, centre, OURS)
         payload, wind = self.flight["envs"][step]
         arrow = FancyArrowPatch(
@@ -118,16 +114,9 @@ class DroneFilm:
         )
         above = {"transform": axes.transAxes, "clip_on": False}
         draw_once(axes, Text(0, 1.04, text, fontsize=11, **above))
-        if self.crashed is not None:
+        if step > end:
             look = {"ha": "right", "fontweight": "bold", "color": NOMINAL}
             draw_once(axes, Text(1, 1.04, "hit a wall", fontsize=11, **look, **above))
-
-    def _hits(self, step, half):
-        """Whether the nominal drone touches a wall in the steps of this frame."""
-        positions = self.flight["nominal"][max(step - EVERY, 0) : step + 1, :2]
-        away = positions[:, None] - self.flight["windows"]
-        beside = np.maximum(half - np.abs(away[..., 1]), 0.0)
-        return np.min(np.hypot(away[..., 0], beside)) <= self.radius
 
     def _draw_drone(self, axes, name, step, centre, colour):
         """Draw cage, arms, rotors and payload of a drone."""

@@ -47,7 +47,7 @@ def test_a_cage_passes_a_window_within_the_bound_and_hits_its_edge_beyond(course
         gaps = np.asarray(windows)
 
         def gap(away, path=path, gaps=gaps):
-            return drone.clearance(path + np.asarray(away), gaps, half)
+            return drone.clearances(path + np.asarray(away), gaps, half).min()
 
         # A place between two of the path is up to 1 mm off its line.
         np.testing.assert_allclose(gap((0.0, 0.0)), bound, atol=1e-3)

@@ -267,7 +267,11 @@ def main() -> None:
     try:
         controller = ExportedController(arguments.folder)
         manifest = controller.manifest
-        measured = _in_place(manifest) if "place" in manifest else _straight(manifest)
+        measured = (
+            _at_operating_point(manifest)
+            if "operating_point" in manifest
+            else _straight(manifest)
+        )
         names = [entry["name"] for entry in manifest["controls"]]
     except (ExportError, *MALFORMED) as reason:
         sys.exit(f"run_controller: {type(reason).__name__}: {reason}")
@@ -288,15 +292,17 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def _in_place(manifest: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _at_operating_point(
+    manifest: dict[str, Any],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the inputs of a system at a reference that does not move."""
-    place = manifest["place"]
+    point = manifest["operating_point"]
     box = manifest["environment"]
     rows = manifest["horizon"] + 1
     return (
-        np.asarray(place["observation"], np.float32),
+        np.asarray(point["observation"], np.float32),
         np.mean([box["low"], box["high"]], axis=0),
-        np.tile(np.asarray(place["reference"], np.float32), (rows, 1)),
+        np.tile(np.asarray(point["reference"], np.float32), (rows, 1)),
     )
 
 

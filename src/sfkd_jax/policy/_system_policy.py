@@ -108,7 +108,8 @@ class SystemPolicy(TrainedSystem):
     def interface(self) -> dict[str, Any]:
         """Names, units and limits of controls, observation, e, reference and outputs.
 
-        "place" is the reference in the middle of its ranges, and the state there.
+        "operating_point" has the reference in the middle of its ranges, and the state
+        there.
         """
         tracked = self.loop.tracked
         system = tracked.system
@@ -131,7 +132,7 @@ class SystemPolicy(TrainedSystem):
             },
             "reference": [labels[index] for index in tracked.followed],
             "outputs": self.model.frame.units,
-            "place": {
+            "operating_point": {
                 "observation": np.asarray(at_rest).tolist(),
                 "reference": middle.tolist(),
             },
