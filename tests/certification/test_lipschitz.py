@@ -54,6 +54,14 @@ def test_the_bound_of_a_network_with_a_known_constant_is_tight_from_above(name):
     assert exact * (1 - 1e-14) <= bound <= exact * (1 + 1e-3)
 
 
+@pytest.mark.parametrize("scale", [1e-5, 1e-8, 1e-30])
+def test_a_network_that_training_made_negligible_has_a_bound(scale):
+    weights, multipliers = positive(0)[0], [np.full(8, 0.5), np.full(7, 0.5)]
+    weights = [scale * weights[0], 0.1 * weights[1], scale * weights[2]]
+    bound = lipschitz_upper(weights, multipliers)[0]
+    assert np.prod([np.linalg.norm(part, 2) for part in weights]) <= bound <= 1.01e-4
+
+
 def test_useless_multipliers_prove_nothing():
     weights, multipliers, _ = EXACT["orthogonal"]
     spoiled = [

@@ -32,6 +32,8 @@ SLACKS = (1e-9, 1e-7, 1e-5, 1e-3)
 """Relative slacks on a bound that are tried. The core accepts it with the smallest that
 is above its rounding.
 """
+NEGLIGIBLE = 1e-4
+"""Bound that is tried last, for a network that is so small that rounding hides it."""
 SHARPNESS = (8, 64, 512)
 """Exponents of the p-norm that smooths the largest eigenvalue, one L-BFGS run each."""
 INFEASIBLE = 1e3
@@ -163,8 +165,8 @@ def lipschitz_upper(
         scaled = [scale * np.asarray(part, dtype=np.float64) for part in multipliers]
         eigenvalues, *_ = reduced(weights, scaled, linear)
         guess = float(np.sqrt(np.max(eigenvalues)))
-        for slack in SLACKS:
-            bound = guess * (1 + slack)
+        bounds = [guess * (1 + slack) for slack in SLACKS]
+        for bound in (*bounds, max(NEGLIGIBLE, bounds[-1])):
             # A bound that is not better than the best is not made better by more slack.
             if not bound < best_bound:
                 break
