@@ -5,7 +5,8 @@
 Three systems drive the true cars on the same roads, with the schedule and the sensor noise
 of S3: the policy in its lane; MPPI that knows the car (oracle), whose plans must keep clear
 of what is in view; and the same inside the gate and shield of the policy, along
-the road. The results go to benchmarks/lane.json, one line a row. A row that is there is not
+the road. A fourth one, the policy with `reverse=True` in a car that drives backwards as well,
+meets the pedestrians alone. The results go to benchmarks/lane.json, one line a row. A row that is there is not
 measured again.
 """
 
@@ -39,7 +40,8 @@ APPEAR = 40.0
 SUDDEN = 15.0
 """Distance at which a pedestrian is seen [m]."""
 GUARDED = " in the guard"
-SYSTEMS = ("lane", "oracle", "oracle" + GUARDED)
+REVERSING = "lane, reversing"
+SYSTEMS = ("lane", "oracle", "oracle" + GUARDED, REVERSING)
 
 
 class Car:
@@ -52,8 +54,8 @@ class Car:
 
     def system(self, name):
         """A controller of scenes, whose params are those of the policy."""
-        if name == "lane":
-            return self.policy.in_lane()
+        if name in ("lane", REVERSING):
+            return self.policy.in_lane(reverse=name == REVERSING)
         task = path_following.path_tracking(
             models.physics(self.plant.step),
             path_following.tracking_cost(dt=PERIOD),
@@ -72,9 +74,8 @@ class Car:
         """(scenarios) -> what is recorded of their episodes, (run, time)."""
         # The oracle claims nothing.
         record = {"corridor": lambda info: info.claim.bound} if name != "oracle" else {}
-        episode = driving(
-            self.plant, self.system(name), self.policy.params, record=record
-        )
+        plant = that_reverses(self.plant) if name == REVERSING else self.plant
+        episode = driving(plant, self.system(name), self.policy.params, record=record)
 
         def run(scenario, key):
             made = episode(scenario, key)
@@ -108,6 +109,25 @@ class Car:
             return jax.tree.map(lambda *leaves: np.stack(leaves), *driven)
 
         return drive
+
+
+def that_reverses(plant):
+    """A car that drives backwards where it is told to at rest; slowly, without slip."""
+
+    def step(state, control, env):
+        steering, drive = control[:2]
+        speed = state[3]
+        after = speed + PERIOD * drive
+        way = 0.5 * PERIOD * (speed + after)
+        turned = way * jnp.tan(steering) / plant.wheelbase
+        yaw = state[2] + 0.5 * turned
+        moved = jnp.zeros_like(state).at[:2].set(state[:2])
+        moved = moved.at[:2].add(way * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]))
+        moved = moved.at[2:4].set(jnp.stack([state[2] + turned, after]))
+        backwards = (speed < 0.0) | ((speed == 0.0) & (drive < 0.0))
+        return jnp.where(backwards, moved, plant.step(state, control, env))
+
+    return plant._replace(step=step)
 
 
 def too_near(size, data, state, action, target, at):
@@ -318,6 +338,7 @@ def main():
             for group in options.rows
             if (name, system, group) not in done
             and (group != "time" or system == "lane")
+            and (group == "pedestrian" or system != REVERSING)
         ]
         if not missing:
             continue
