@@ -231,6 +231,15 @@ def test_what_is_spoilt_is_said_and_nothing_is_claimed(name, first):
     assert np.all(np.abs(errors[held, 0]) <= claims[held])
 
 
+@pytest.mark.parametrize(("sigmas", "outside"), [(3.0, False), (6.0, True)])
+def test_a_reading_may_leave_the_box_of_true_states_by_its_noise(sigmas, outside):
+    noise = np.asarray(loop().tracked.system.sensor_noise)
+    of = shield(law_and(lambda step: jnp.zeros(1)), box=((-1.0, -1.0), (0.01, 1.0)))
+    error = jnp.asarray([0.01 + sigmas * noise[0], 0.0])
+    _, _, info = of.act({}, of.init(jax.random.key(0)), error, ENV, AT_REST)
+    assert (info.claim.reason == Reason.OUTSIDE_BOX) == outside
+
+
 def test_another_system_than_the_model_is_noticed_and_nothing_false_is_claimed():
     def heavier(error, control, inputs, env):
         return truth(error, control, inputs, env * jnp.asarray([1.6, 1.0]) + 0.3)

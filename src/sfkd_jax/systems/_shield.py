@@ -94,7 +94,7 @@ class Shield(Stateful):
 
     - If the planner is not healthy, or its control is not finite, the law acts alone.
     - Outside the boxes of ξ, ρ or e (OUTSIDE_BOX) nothing is certified, and the law
-      acts alone.
+      acts alone. A reading may leave that of ξ by the noise of the sensors.
     - If |y − ŷ| exceeds the tube by more than the noise of the sensors
       (BOUND_EXCEEDED), the bound does not hold for this system.
     - After any of these the nominal model starts anew at the next measurement.
@@ -255,12 +255,17 @@ class Shield(Stateful):
 
     def _outside(self, error: Error, inputs: Inputs) -> Bool[Array, ""]:
         """Return whether ξ or ρ is outside of its box."""
+        # The box of ξ is that of true states, and a reading has noise.
+        noise = SIGMAS * jnp.asarray(self.loop.tracked.system.sensor_noise)
+        boxes = (
+            (self.box, error, noise),
+            (self.loop.tracked.frame.input_box, inputs, 0.0),
+        )
         outside = jnp.asarray(False)
-        boxes = ((self.box, error), (self.loop.tracked.frame.input_box, inputs))
-        for (low, high), point in boxes:
+        for (low, high), point, inexact in boxes:
             lower = jnp.asarray(low)
             upper = jnp.asarray(high)
-            room = ROUNDING * (upper - lower)
+            room = ROUNDING * (upper - lower) + inexact
             inside = (lower - room <= point) & (point <= upper + room)
             outside |= ~jnp.all(inside)
         return outside
