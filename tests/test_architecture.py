@@ -66,7 +66,7 @@ DRIVING = {
     "driving.simulation": PLANT | {"evaluation"},
     "driving.certificate": {"ranges", "store", "certificate", "latency"},
     "driving.corridor": PLANT
-    | {"certificate", "certification", "control", "data"}
+    | {"certificate", "certification", "control", "data", "progress"}
     | {"driving.certificate", "driving.drives", "driving.path_following"},
 }
 """The floor for vehicles along paths."""

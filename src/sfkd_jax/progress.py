@@ -8,12 +8,16 @@ from typing import Any
 
 from sfkd_jax.store import print_message
 
+APART = 30.0
+"""Time after which there is a new line where there is no bar [s]."""
+
 
 class Progress:
     """Work in steps that are counted, with the time that is left.
 
-    On a terminal it is a bar of tqdm, if that is installed. Elsewhere every `note` is a
-    line, such as in the log of a batch job.
+    On a terminal it is a bar of tqdm, if that is installed. Elsewhere, such as in the
+    log of a batch job, every `note` is a line, and there is one at least every `APART`
+    seconds.
 
         with Progress("training", 6000) as progress:
             progress.advance(50)
@@ -33,6 +37,7 @@ class Progress:
         self._first = done
         self._done = done
         self._began = time.monotonic()
+        self._said = self._began
         self._bar = _bar(name, total, done)
 
     def __enter__(self) -> Progress:
@@ -49,22 +54,29 @@ class Progress:
         self._done += count
         if self._bar is not None:
             self._bar.update(count)
+        elif time.monotonic() - self._said >= APART:
+            self._say("")
 
     def note(self, text: str) -> None:
         """Say something about the work so far."""
         if self._bar is not None:
             self._bar.set_postfix_str(text)
-            return
+        else:
+            self._say(f": {text}")
+
+    def _say(self, text: str) -> None:
+        """Print a line with what is done so far, and the time that is left."""
+        self._said = time.monotonic()
         clock = time.strftime("%H:%M:%S")
-        counted = f"{clock} {self._name} {self._done} / {self._total}"
-        print_message(f"{counted}, {self._left()} left: {text}")
+        counted = f"{clock} {self._name} {self._done:,} / {self._total:,}"
+        print_message(f"{counted}, {self._left()} left{text}")
 
     def _left(self) -> str:
         """Return the time that is left at the rate so far, such as "1:20"."""
         done = self._done - self._first
         if not done:
             return "?"
-        seconds = (time.monotonic() - self._began) / done * (self._total - self._done)
+        seconds = (self._said - self._began) / done * (self._total - self._done)
         minutes, rest = divmod(round(seconds), 60)
         hours, minutes = divmod(minutes, 60)
         return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -74,19 +74,23 @@ def test_a_logger_changes_neither_a_run_nor_its_name(name):
 
 
 def test_progress_counts_what_was_done_before_and_says_what_is_left(capfd, monkeypatch):
-    now = iter([100.0, 130.0, 160.0])
-    monkeypatch.setattr("sfkd_jax.progress.time.monotonic", lambda: next(now))
-    with Progress("training", 400, 100) as progress:
+    now = 100.0
+    monkeypatch.setattr("sfkd_jax.progress.time.monotonic", lambda: now)
+    with Progress("training", 4000, 1000) as progress:
         progress.note("begins")
-        progress.advance(100)
-        progress.note("loss 2")
-        progress.advance(100)
+        now = 129.0
+        progress.advance(500)  # no line yet: half a minute has not passed
+        now = 130.0
+        progress.advance(500)
+        now = 160.0
+        progress.advance(1000)
         progress.note("loss 1")
-    first, second, third = capfd.readouterr().err.splitlines()
-    assert "training 100 / 400, ? left: begins" in first
-    assert "training 200 / 400, 1:00 left: loss 2" in second
-    # 200 steps in a minute.
-    assert "training 300 / 400, 0:30 left: loss 1" in third
+    first, second, third, fourth = capfd.readouterr().err.splitlines()
+    assert "training 1,000 / 4,000, ? left: begins" in first
+    assert "training 2,000 / 4,000, 1:00 left" in second
+    # 2000 steps in a minute.
+    assert "training 3,000 / 4,000, 0:30 left" in third
+    assert "training 3,000 / 4,000, 0:30 left: loss 1" in fourth
 
 
 def test_on_a_terminal_progress_is_a_bar(capfd, monkeypatch):

@@ -260,7 +260,6 @@ def _measure_corridor(run: Run, trained: policy.TrainedModel, proof: Proof) -> C
         proof.outputs,
         {**store.plain(settings.dataset), **run.source.box},
         settings.certification.level,
-        store.print_message,
         identified_from=getattr(settings.vehicle, "contents", None),
         **arguments(settings.certification.corridor, measure_corridor),
     )

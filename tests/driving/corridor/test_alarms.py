@@ -35,7 +35,7 @@ def test_what_the_calibration_of_alarms_writes_can_be_read(tail):
         levels = np.abs(steps[..., 0]) % 3.0
         return jnp.asarray(steps, jnp.float32), jnp.nan_to_num(jnp.asarray(levels))
 
-    found = calibrate_innovations(observe, observe, jax.random.key(0), duration=6.0)
+    found = calibrate_innovations(observe, observe, jax.random.key(0), 6.0)
     written = json.loads(json.dumps(plain(asdict(found))))
     assert read_as(Innovations, written) == found
     assert np.min(found.deviation) > 0

@@ -1,6 +1,8 @@
 """The corridor: joint bounds, and a policy end to end."""
 
+from contextlib import redirect_stderr
 from dataclasses import replace
+from io import StringIO
 
 import jax
 import numpy as np
@@ -106,12 +108,15 @@ def test_a_certificate_with_a_corridor_is_written_read_and_verified(tmp_path):
         level=0.9,
     )
     small = {"runs": 24, "duration": 4.0, "attack_steps": 3000, "later": (0.1,)}
-    said = []
-    corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, said.append, **small)
-    # A line before each part of the runs, with the steps of the vehicle in it.
-    assert "corridor: part 1 of 16 of the runs, 2,880 steps of the vehicle" in said
-    assert any(line.startswith("corridor: part 16 of 16") for line in said)
-    assert "corridor: attack, 3,000 steps of the vehicle" in said
+    with pytest.MonkeyPatch.context() as patch, redirect_stderr(StringIO()) as said:
+        patch.setattr("sfkd_jax.progress.APART", 0.0)
+        corridor = measure_corridor(loop, proof.outputs, DATA, 0.9, **small)
+    # A line after each part of the runs, with the steps of the vehicle so far: 16 parts
+    # and the attack, and three parts each of the later sensors and controls.
+    lines = said.getvalue().splitlines()
+    assert len(lines) == 16 + 1 + 6
+    assert "steps of the vehicle 2,880 / 66,360, " in lines[0]
+    assert "steps of the vehicle 66,360 / 66,360, 0:00 left" in lines[-1]
     settings = {
         "space": path_space()._asdict(),
         "environment": {"low": BOX["env_low"], "high": BOX["env_high"]},

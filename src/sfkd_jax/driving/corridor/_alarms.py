@@ -139,7 +139,6 @@ def calibrate_innovations(
     observe: Callable[[Key], Observed],
     observe_s3: Callable[[Key], Observed],
     key: Key,
-    *,
     duration: float,
 ) -> Innovations:
     """Return the calibration of the test of innovations.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -27,6 +27,7 @@ from sfkd_jax.driving.certificate import (
     Conditions,
     Corridor,
     GroupBounds,
+    Innovations,
     JointBounds,
     LateCorridor,
     Recorded,
@@ -34,6 +35,7 @@ from sfkd_jax.driving.certificate import (
 )
 from sfkd_jax.driving.corridor._alarms import (
     BATCHES,
+    Observed,
     calibrate_innovations,
     innovations,
     simulate_nominal,
@@ -50,6 +52,7 @@ from sfkd_jax.driving.corridor._runs import (
     EXCITATION,
     ROAD_SETTINGS,
     Driver,
+    Part,
     drivers_of,
     measure_runs,
 )
@@ -57,6 +60,7 @@ from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.driving.drives import Reading
 from sfkd_jax.driving.scenarios import DRIVES
 from sfkd_jax.latency import Delays
+from sfkd_jax.progress import Progress
 from sfkd_jax.ranges import Interval, Span
 from sfkd_jax.types import Key, Trajectory
 
@@ -72,52 +76,46 @@ LATE_STREAM = 6
 
 PARTS = 4 + 2 + BATCHES
 """Parts of the runs: for units, bounds, coverage and S3, and those of the alarms."""
+LATE_PARTS = 3
+"""Parts of the runs that are later than stated: for units, bounds and coverage."""
 
 
-@dataclass
-class _Progress:
-    """What is said before every part of the runs.
+def _counted(progress: Progress, steps: int, driver: Driver) -> Driver:
+    """Return a driver that counts the steps of the vehicle in its runs."""
 
-    Attributes:
-        report: is called with a line.
-        steps: of the vehicle in a part.
-        begun: number of parts that were begun.
-    """
+    def driven(key: Key) -> tuple[Trajectory, Reading | None]:
+        made = jax.block_until_ready(driver(key))
+        progress.advance(steps)
+        return made
 
-    report: Callable[[str], None]
-    steps: int
-    begun: int = 0
-
-    def reported(self, driver: Driver) -> Driver:
-        """Return a driver that says which part it drives."""
-
-        def driven(key: Key) -> tuple[Trajectory, Reading | None]:
-            self.begun += 1
-            self.report(
-                f"corridor: part {self.begun} of {PARTS} of the runs, "
-                f"{self.steps:,} steps of the vehicle"
-            )
-            return driver(key)
-
-        return driven
+    return driven
 
 
-def _reported_drivers(
-    report: Callable[[str], None],
+def _measure_parts(
     loop: Loop,
-    settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
-) -> tuple[Driver, Driver]:
-    """Return drivers under the conditions and on S3, which say what they drive.
+    claims: Mapping[str, OutputMetric],
+    drivers: tuple[Driver, ...],
+    run_keys: list[Key],
+    sensor_key: Key,
+) -> list[Part]:
+    """Measure runs for units, bounds and coverage, and those of S3.
 
     Args:
-        report: is called with a line before every part of the runs.
         loop: of the policy.
-        settings: of the drivers, see `drivers_of`.
+        claims: proved metrics by the names of the outputs.
+        drivers: under the conditions, and on S3.
+        run_keys: of the runs of each part; consumed.
+        sensor_key: of what the nominal models start from; consumed.
     """
-    _, runs, duration, _ = settings
-    progress = _Progress(report, len(DRIVES) * runs * round(duration / loop.plant.dt))
-    drive, drive_s3 = drivers_of(loop, *settings)
-    return progress.reported(drive), progress.reported(drive_s3)
+    simulate = jax.jit(partial(simulate_nominal, loop))
+    drive, drive_s3 = drivers
+    sensor_keys = jax.random.split(sensor_key, len(run_keys))
+    return [
+        measure_runs(loop, claims, simulate, driver(run_key)[0], key)
+        for driver, run_key, key in zip(
+            (drive, drive, drive, drive_s3), run_keys, sensor_keys, strict=True
+        )
+    ]
 
 
 def measure_corridor(
@@ -125,7 +123,6 @@ def measure_corridor(
     claims: Mapping[str, OutputMetric],
     data: Mapping[str, Any],
     level: float,
-    report: Callable[[str], None],
     *,
     runs: int = 150,
     duration: Annotated[float, Interval("(2, inf)")] = 60.0,
@@ -147,7 +144,6 @@ def measure_corridor(
         data: settings of the data set: `ROAD_SETTINGS`, `EXCITATION`, env_low,
             env_high, seed and law.
         level: 1 − δ.
-        report: is called with a line before every part of the work.
         runs: number of runs of each part.
         duration: of a run [s].
         dwell: range of times between switches [s].
@@ -165,26 +161,28 @@ def measure_corridor(
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    settings = data, runs, duration, dwell
-    drive, drive_s3 = _reported_drivers(report, loop, settings)
-    simulate = jax.jit(partial(simulate_nominal, loop))
-    drivers = (drive, drive, drive, drive_s3)
-    sensor_keys = jax.random.split(sensor_key, len(drivers))
-    units, calibration, test, s3 = (
-        measure_runs(loop, claims, simulate, driver(run_key)[0], key)
-        for driver, run_key, key in zip(drivers, run_keys, sensor_keys, strict=True)
-    )
-    scores = [part.scores for part in (units, calibration, test)]
-    bounds, groups = _bounds_of_groups(scores, level)
-    tube = bounds.vehicle_to_nominal_position
-    # The shortest dwell: an attack switches as often as the conditions allow.
-    dwell_steps = max(1, round(dwell[0] / loop.plant.dt))
-    search = WorstRuns(loop, claims["position"], tube, data, dwell_steps, attack_steps)
-    observe = partial(_observed, jax.jit(partial(innovations, loop)))
-    observers = (partial(observe, drive), partial(observe, drive_s3))
-    alarms = calibrate_innovations(*observers, stream(ALARM_STREAM), duration=duration)
-    report(f"corridor: attack, {attack_steps:,} steps of the vehicle")
-    late = partial(_late_corridors, loop, later, claims, level, settings)
+    of_part = len(DRIVES) * runs * round(duration / loop.plant.dt)
+    total = (PARTS + 2 * LATE_PARTS * len(later)) * of_part + attack_steps
+    with Progress("steps of the vehicle", total) as progress:
+
+        def drivers_of_loop(loop: Loop) -> tuple[Driver, ...]:
+            counted = partial(_counted, progress, of_part)
+            return tuple(map(counted, drivers_of(loop, data, runs, duration, dwell)))
+
+        drivers = drivers_of_loop(loop)
+        measured = _measure_parts(loop, claims, drivers, run_keys, sensor_key)
+        *known, s3 = measured
+        bounds, groups = _bounds_of_groups([part.scores for part in known], level)
+        tube = bounds.vehicle_to_nominal_position
+        # The shortest dwell: an attack switches as often as the conditions allow.
+        shortest = max(1, round(dwell[0] / loop.plant.dt))
+        search = WorstRuns(loop, claims["position"], tube, data, shortest, attack_steps)
+        alarms = _alarms(loop, drivers, stream(ALARM_STREAM), duration)
+        attack = attack_corridor(search, attack_key, bounds.nominal, horizon)
+        progress.advance(attack_steps)
+        late = partial(_late_corridors, loop, later, claims, level, drivers_of_loop)
+        late_sensors = late("sensors", stream(LATE_STREAM))
+        late_controls = late("controls", stream(LATE_STREAM))
     return Corridor(
         conditions=_conditions(loop, data, duration, dwell, identified_from),
         level=level,
@@ -193,17 +191,16 @@ def measure_corridor(
         corridor_m=bounds.nominal + tube,
         coverage=_coverage_of_worst(groups),
         by_group=groups,
-        # Reported beside the claim and no part of it, since S3 does not meet the
-        # conditions.
+        # No part of the claim, since S3 does not meet the conditions.
         by_scenario={"s3": corridor_coverage(bounds, s3.scores)},
-        seen=test.largest(),
-        attack=attack_corridor(search, attack_key, bounds.nominal, horizon),
+        seen=known[-1].largest(),
+        attack=attack,
         innovations=alarms,
-        failed_runs=sum(part.failed for part in (units, calibration, test, s3)),
+        failed_runs=sum(part.failed for part in measured),
         shield_horizon=horizon,
         margins=law_margins(loop, data),
-        late_sensors=late("sensors", stream(LATE_STREAM)),
-        late_controls=late("controls", stream(LATE_STREAM)),
+        late_sensors=late_sensors,
+        late_controls=late_controls,
         seconds=time.perf_counter() - began,
     )
 
@@ -213,7 +210,7 @@ def _late_corridors(
     delays: Delays,
     claims: Mapping[str, OutputMetric],
     level: float,
-    settings: tuple[Mapping[str, Any], int, float, tuple[float, float]],
+    drivers: Callable[[Loop], tuple[Driver, ...]],
     late: Literal["sensors", "controls"],
     key: Key,
 ) -> tuple[LateCorridor, ...]:
@@ -224,7 +221,7 @@ def _late_corridors(
         delays: in addition to the latency of the loop [s].
         claims: proved metrics by the names of the outputs.
         level: 1 − δ.
-        settings: of the drivers, see `drivers_of`.
+        drivers: loop -> its drivers under the conditions, and on S3.
         late: what is later.
         key: used anew for every delay, so that all meet the same roads; consumed.
     """
@@ -232,10 +229,10 @@ def _late_corridors(
     for delay in sorted(delays):
         longer = tuple(delay + one for one in getattr(loop.latency, late))
         later = loop._replace(latency=replace(loop.latency, **{late: longer}))
-        driver, _ = drivers_of(later, *settings)
+        driver, _ = drivers(later)
         simulate = jax.jit(partial(simulate_nominal, later))
         scores = []
-        for part in range(3):
+        for part in range(LATE_PARTS):
             run_key, sensor_key = jax.random.split(jax.random.fold_in(key, part))
             runs, _ = driver(run_key)
             measured = measure_runs(later, claims, simulate, runs, sensor_key)
@@ -351,11 +348,27 @@ def _bounds_of_groups(
     return bounds, groups
 
 
+def _alarms(
+    loop: Loop, drivers: tuple[Driver, ...], key: Key, duration: float
+) -> Innovations:
+    """Return the calibration of the alarms of a loop.
+
+    Args:
+        loop: of the policy.
+        drivers: under the conditions, and on S3.
+        key: of the runs; consumed.
+        duration: of a run [s].
+    """
+    compiled = jax.jit(partial(innovations, loop))
+    observe, observe_s3 = (partial(_observed, compiled, driver) for driver in drivers)
+    return calibrate_innovations(observe, observe_s3, key, duration)
+
+
 def _observed(
     innovations_of: Callable[[Reading], Any],
     driver: Driver,
     key: Key,
-) -> Any:
+) -> Observed:
     """Return innovations and levels of runs.
 
     A run in which a simulator failed is replaced by another run.
