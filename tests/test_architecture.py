@@ -42,7 +42,8 @@ GROUND = {
     "evaluation": CORE,
     "certification": CORE | {"certificate", "data"},
     "systems": CORE | {"certificate", "control", "schedules", "tables"},
-    "tubes": CORE | {"certificate", "certification", "enclosures", "systems"},
+    "tubes": CORE
+    | {"certificate", "certification", "enclosures", "progress", "systems"},
 }
 """The floor for any system with an environment: package -> what it may import."""
 ROAD = (

@@ -23,6 +23,7 @@ from sfkd_jax.driving.scenarios import COURSES, Scenario
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
 from sfkd_jax.experiment.run import Run
+from sfkd_jax.progress import Progress
 from sfkd_jax.rollout import fold, on_host, unfold
 from sfkd_jax.settings import arguments, choose
 from sfkd_jax.types import Controller, Key, Params
@@ -107,8 +108,12 @@ def _over_episodes(
             return jax.block_until_ready(program(*inputs_of_one))
 
         pool = ThreadPoolExecutor(min(count, cores))
+        episodes = []
         try:
-            episodes = list(pool.map(run_one, inputs))
+            with Progress("episodes", count) as progress:
+                for episode in pool.map(run_one, inputs):
+                    episodes.append(episode)
+                    progress.advance()
         finally:
             # Nobody waits for the episodes of an interrupted command.
             pool.shutdown(wait=False, cancel_futures=True)

@@ -14,6 +14,7 @@ from sfkd_jax.control import size_of
 from sfkd_jax.info import ControllerInfo
 from sfkd_jax.models import physics
 from sfkd_jax.policy import SystemPolicy, planner_of
+from sfkd_jax.progress import Progress
 from sfkd_jax.ranges import AtLeastOne, Positive
 from sfkd_jax.schedules import random_switching
 from sfkd_jax.systems import ClosedLoop, Following, System, Tracked, random_reference
@@ -149,7 +150,8 @@ def run_controller(
         return SystemRuns(*recorded)
 
     keys = jax.random.split(key, len(scenes.envs))
-    return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))(params, scenes, keys)
+    simulate = jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))
+    return jax.block_until_ready(simulate(params, scenes, keys))
 
 
 def drive_beside_rivals(
@@ -172,9 +174,13 @@ def drive_beside_rivals(
     scene_key, drive_key = jax.random.split(jax.random.key(seed))
     scenes = random_scenes(policy, scene_key, runs=runs, duration=duration)
     drive = partial(run_controller, policy, system.step, scenes=scenes, key=drive_key)
-    driven = {POLICY: drive(controller=policy.controller, params=policy.params)}
-    for name, controller in rivals(policy, system).items():
-        driven[name] = drive(controller=controller, params={})
+    others = rivals(policy, system)
+    with Progress("controllers", 1 + len(others)) as progress:
+        driven = {POLICY: drive(controller=policy.controller, params=policy.params)}
+        progress.advance()
+        for name, controller in others.items():
+            driven[name] = drive(controller=controller, params={})
+            progress.advance()
     return driven
 
 

@@ -20,6 +20,7 @@ from sfkd_jax.certification import (
     residuals,
     rows,
 )
+from sfkd_jax.progress import Progress
 from sfkd_jax.ranges import AtLeastOne, Fraction, Positive, Span
 from sfkd_jax.rollout import in_batches, rollout
 from sfkd_jax.systems import (
@@ -33,6 +34,8 @@ from sfkd_jax.types import BODY, Environment, Key, Model, Params, State, Traject
 
 RUNS_AT_ONCE = 50
 """Runs that the nominal model predicts at once."""
+PARTS = 3
+"""Parts of the runs: for units, bounds and coverage."""
 FORM = "vehicle_to_nominal"
 """The bound from the sequence of all disturbances of a run, see `radii`."""
 
@@ -84,9 +87,12 @@ def measure_tubes(
         )
         return _scores(loop, model, params, claims, nominal, trajectories, sensor_key)
 
-    units, _ = part(0)
-    scores, own = part(1)
-    unseen, _ = part(2)
+    measured = []
+    with Progress("runs", PARTS * runs) as progress:
+        for index in range(PARTS):
+            measured.append(part(index))
+            progress.advance(runs)
+    (units, _), (scores, own), (unseen, _) = measured
     bounds = conformal_bounds(units, scores, level=level)
     tubes, nominals = np.split(bounds, 2)
     outputs = {
