@@ -50,10 +50,11 @@ class Answers(BaseHTTPRequestHandler):
         parts = [unquote(part) for part in urlsplit(self.path).path.split("/")[1:]]
         self.hub.asked.append(parts)
         is_api = parts[0] == "api"
-        owner, name, kind, revision, *rest = parts[2:] if is_api else parts
+        owner, name, *asked = parts[2:] if is_api else parts
         commits = self.hub.repositories.get(f"{owner}/{name}")
         if commits is None:
             return self.answer({}, 404, {"X-Error-Code": "RepoNotFound"})
+        kind, revision, *rest = asked or ["revision", "main"]
         if revision == "main":
             revision = [*commits][-1]
         if revision not in commits:

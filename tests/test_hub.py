@@ -38,7 +38,8 @@ def first_control(policy):
     state = policy.controller.init(jax.random.key(0))
     x = jnp.asarray([0.0, 0.3, 0.0, 10.0])
     e = jnp.asarray([0.6, 0.0])
-    return policy.controller.act(policy.params, state, x, e, straight(20))[0]
+    act = jax.jit(policy.controller.act)
+    return act(policy.params, state, x, e, straight(20))[0]
 
 
 def test_what_is_loaded_is_what_was_pushed(pushed):
@@ -87,13 +88,20 @@ def test_a_version_is_asked_for_and_a_push_leaves_nothing_of_the_one_before(push
 def test_without_a_network_the_cache_is_read(pushed, monkeypatch):
     policy, hub, _ = pushed
     sfkd_jax.load(ADDRESS)
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     asked = len(hub.asked)
-    assert sfkd_jax.load(ADDRESS).certificate == policy.certificate
-    line = refusal_of(lambda: sfkd_jax.load("hf://someone/else"))
-    assert line == (
-        "hf://someone/else: the Hub cannot be reached, and it was not downloaded before"
-    )
+    # Nobody asks for the network, or nobody answers there.
+    for name, value in (("HF_HUB_OFFLINE", True), ("ENDPOINT", "http://127.0.0.1:9")):
+        with monkeypatch.context() as patch:
+            patch.setattr(constants, name, value)
+            assert sfkd_jax.load(ADDRESS).certificate == policy.certificate
+            line = refusal_of(lambda: sfkd_jax.load("hf://someone/else"))
+            assert line == (
+                "hf://someone/else: the Hub cannot be reached, and it was not "
+                "downloaded before"
+            )
+            line = refusal_of(lambda: policy.push(NAME))
+            assert line is not None
+            assert line.startswith(f"{ADDRESS}: ")
     assert len(hub.asked) == asked
 
 
