@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from sfkd_jax.certificate import Certificate
 
 CARD = "README.md"
@@ -46,12 +48,13 @@ _CERTIFIED = """
 
 The learned model contracts: at every step the distance between two of its predictions
 shrinks to {alpha:.4f} of what it was, or less, for every environment in its box. The
-proof is about the float32 weights in this repository, and `load` checks it.
+proof is about the float32 weights in this repository, and `load` checks it again.
 
 ## What is measured
 
 The other numbers above. Bounds hold with a probability of {level:g} %, unless the text
-states another one, on runs like those that were measured. {signer}
+states another one, on runs like those that were measured.
+{signer}
 
 ## Under which conditions
 
@@ -91,7 +94,8 @@ def model_card(
         key = certificate.signature.public_key
         signer = f"Who holds the key {key} vouches for them, see `signed_by` of `load`."
     return head + _CERTIFIED.format(
-        alpha=certificate.proof.alpha,
+        # Rounded up, since it is a bound.
+        alpha=math.ceil(1e4 * certificate.proof.alpha) / 1e4,
         level=100.0 * certificate.measured.d_bar.level,
         signer=signer,
     )
