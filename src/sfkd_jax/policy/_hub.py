@@ -18,7 +18,9 @@ from sfkd_jax.store import ArtefactError, one_line, read_json
 SCHEME = "hf://"
 """What the address of a policy on the Hub begins with."""
 REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
+"""Owner and name of a repository."""
 REVISION = re.compile(r"[\w./-]+", re.ASCII)
+"""A commit, a branch or a tag."""
 
 
 @runtime_checkable
@@ -180,7 +182,7 @@ def _one_line(address: str) -> Iterator[None]:
     # Its client of HTTP is another one in other versions, and so are its exceptions.
     except Exception as other:
         lines = str(other).strip().splitlines() or [type(other).__name__]
-        reason = one_line(lines[0])
+        raise ArtefactError(f"{address}: {one_line(lines[0])}") from other
     else:
         return
     raise ArtefactError(f"{address}: {reason}")
