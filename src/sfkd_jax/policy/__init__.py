@@ -270,10 +270,8 @@ def _load_vehicle(
     # Errors are about the file, unless the caller asked for something else.
     unchanged = controller is None and latency is None
     as_saved = unchanged and env_source == "measured" and not adaptive
-    if latency is not None:
-        settings = _stating(settings, latency)
     with store.as_artefact_error(file, ValueError) if as_saved else nullcontext():
-        latency = _latency_of(trained, certificate, latency)
+        compensated = _latency_of(trained, certificate, latency)
         around = partial(
             assembly.build_controller,
             settings["controller"],
@@ -285,9 +283,11 @@ def _load_vehicle(
             certificate=certificate,
             law=trained.law,
             adaptive=adaptive,
-            latency=latency,
+            latency=compensated,
         )
         planner = around()
+    # What the certificate states is not added: it is bound to the settings as they are.
+    settings = settings if latency is None else _stating(settings, compensated)
     signature = "unsigned"
     if certificate is not None:
         signature = describe_signature(certificate.sha256, certificate.signature)
@@ -300,7 +300,7 @@ def _load_vehicle(
         certificate=certificate,
         signature=signature,
         around=around,
-        latency=latency,
+        latency=compensated,
     )
 
 
