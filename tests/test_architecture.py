@@ -128,7 +128,7 @@ THIRD_PARTY = {
     "driving.corridor": {"numpy", "scipy"},
     "paper": {"numpy"},
     "report": {"numpy", "pandas", "matplotlib", "PIL", "jinja2"},
-    "policy": {"numpy"},
+    "policy": {"huggingface_hub", "numpy"},
     "assembly": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
     "export": {"numpy", "iree"},
@@ -140,8 +140,8 @@ HEAVY = {
     *("optax", "pandas", "scipy", "pyarrow", "pint"),
 }
 """What `import sfkd_jax.control` does not load."""
-FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels"}
-"""What is loaded when its adapter is asked for."""
+FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels", "huggingface_hub"}
+"""What is loaded when its adapter, or the Hub, is asked for."""
 
 LONGEST_FILE = 400
 """Lines of a file of src, docstrings included."""

@@ -105,10 +105,7 @@ def test_its_data_have_eight_states_and_its_loop_seven_coordinates():
 
 def test_a_policy_of_it_says_its_names_and_units():
     shipped = policy.restore(policy.SHIPPED / "dynamic_path")
-    # As `load` adds it.
-    environment = shipped.settings["environment"] | {"source": "measured"}
-    told = {**shipped.settings, "environment": environment}
-    trained = replace(shipped, vehicle=electric(), settings=told)
+    trained = replace(shipped, vehicle=electric())
     latency = Latency().sized(len(trained.vehicle.states), 2)
     text = policy.describe(trained, None, "unsigned", latency)
     assert "steering [rad], charge [kWh]" in text

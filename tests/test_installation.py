@@ -1,17 +1,26 @@
-"""A wheel without the extras loads a policy: the packages of `train` are not needed."""
+"""A wheel without the extras loads a policy: the packages of `train` are not needed.
+
+It is built from the source distribution, which is therefore whole.
+"""
 
 import os
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
+import sfkd_jax
+
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+VERSION = PROJECT["version"]
 PROGRAM = """
 import importlib.abc, runpy, sys
 
@@ -26,7 +35,7 @@ sys.path.insert(0, sys.argv[1])
 import sfkd_jax.control
 import jax, jax.numpy as jnp
 assert sfkd_jax.__file__.startswith(sys.argv[1]), sfkd_jax.__file__
-policy = sfkd_jax.load(sys.argv[1] + "/sfkd_jax/pretrained/kinematic")
+policy = sfkd_jax.load("kinematic")
 assert policy.certificate
 steps = jnp.arange(1.0, 21.0)
 reference = jnp.stack([steps, 0 * steps, 0 * steps, 0 * steps + 10.0], axis=1)
@@ -43,27 +52,78 @@ for start in map(run, ("train", "report", "export")):
         start()
     except SystemExit as ended:
         print(ended)
+try:
+    sfkd_jax.load("hf://owner/name")
+except sfkd_jax.ArtefactError as refused:
+    print(refused)
 """
 TRAIN = (
     "cvxpy,clarabel,filelock,hydra,omegaconf,jinja2,matplotlib,pandas,pint,pyarrow,"
-    "threadpoolctl,brax,gymnasium,pytest,yapf"
+    "threadpoolctl,brax,gymnasium,huggingface_hub,pytest,yapf"
 )
 """What flax itself imports or requires (optax, orbax, rich) is there."""
 
 
-@pytest.fixture(scope="module")
-def unpacked(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps"]
-    command += ["--no-build-isolation", "-w", str(folder), str(ROOT)]
-    built = subprocess.run(command, capture_output=True, text=True)
-    if "hatchling" in built.stderr:
+def built(kind, source, folder):
+    """The file that a build of a source tree makes: "sdist" or "wheel"."""
+    command = [sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", folder]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    if "No module named hatchling" in done.stderr:
         pytest.skip("hatchling is not installed, and nothing is downloaded here")
-    assert built.returncode == 0, built.stderr
-    (wheel,) = folder.glob("*.whl")
+    assert done.returncode == 0, done.stderr
+    (file,) = folder.iterdir()
+    return file
+
+
+def contents(wheel):
+    """Its files by name, but for the list of their hashes."""
     with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder / "site")
-    return folder / "site"
+        names = [name for name in archive.namelist() if not name.endswith("/RECORD")]
+        return {name: archive.read(name) for name in names}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel of the source distribution."""
+    folder = tmp_path_factory.mktemp("built")
+    with tarfile.open(built("sdist", ROOT, folder / "sdist")) as archive:
+        archive.extractall(folder, filter="data")
+    return built("wheel", folder / f"sfkd_jax-{VERSION}", folder / "wheel")
+
+
+@pytest.fixture(scope="module")
+def unpacked(wheel):
+    site = wheel.parent / "site"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    return site
+
+
+def test_the_source_distribution_makes_the_same_wheel(wheel, tmp_path):
+    assert contents(wheel) == contents(built("wheel", ROOT, tmp_path / "wheel"))
+
+
+def test_a_command_finds_its_options_in_the_wheel(unpacked, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "sfkd_jax.train", "--help"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(unpacked)},
+    )
+    assert done.returncode == 0, done.stderr
+    for group in (ROOT / "conf" / "experiment").glob("*.yaml"):
+        assert group.stem in done.stdout
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_every_file_states_the_same_version():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    released = re.findall(
+        r"^## \[(\d\S*)\] - \d{4}-\d{2}-\d{2}$", changes, re.MULTILINE
+    )
+    assert {VERSION, sfkd_jax.__version__, str(cited["version"])} == {released[0]}
 
 
 def test_a_policy_acts_and_a_command_says_what_it_lacks(unpacked):
@@ -77,8 +137,9 @@ def test_a_policy_acts_and_a_command_says_what_it_lacks(unpacked):
         cwd=unpacked,
         env={"PATH": "", "PYTHONPATH": ""} | compiling,
     )
-    line = 'sfkd_jax: this needs hydra: pip install "sfkd-jax[train]"'
-    assert done.stdout.splitlines() == 3 * [line], done
+    train = 'sfkd_jax: this needs hydra: pip install "sfkd-jax[train]"'
+    hub = 'hf://owner/name: this needs huggingface_hub: pip install "sfkd-jax[hub]"'
+    assert done.stdout.splitlines() == [*3 * [train], hub], done
 
 
 def test_the_lock_pins_the_tested_versions_by_hashes_and_names_no_host():
@@ -95,8 +156,8 @@ def test_the_lock_pins_the_tested_versions_by_hashes_and_names_no_host():
 
 
 def test_the_lock_has_what_the_package_needs():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    needed = project["dependencies"] + project["optional-dependencies"]["train"]
+    extras = PROJECT["optional-dependencies"]
+    needed = PROJECT["dependencies"] + extras["train"] + extras["hub"]
     lock = (ROOT / "requirements.lock").read_text("utf-8")
     pinned = dict(re.findall(r"^([\w.-]+)==([\w.]+)", lock, re.MULTILINE))
     for requirement in map(Requirement, needed):

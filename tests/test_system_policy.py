@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from documents import hashed
 from helpers import put, refusal_of
+from hub import served
 from loops import DT, FASTEST, LIMIT, frame, loop, mass, pushed, tracked
 
 import sfkd_jax
@@ -79,6 +80,24 @@ def test_the_policy_is_loaded_with_its_verified_certificate(certified):
     assert f"|position| <= {bounds.total:.4g} m" in lines[-1]
     assert bounds.total == bounds.tube + bounds.nominal
     assert 0.86 - 0.05 < again.certificate.proof.alpha < 1.0
+
+
+def test_it_is_loaded_from_the_hub_as_it_was_pushed(certified, tmp_path):
+    policy = certified[1]
+    with served(tmp_path) as hub:
+        address = policy.push("someone/mass")
+        again = sfkd_jax.load(address)
+        files = hub.files("someone/mass")
+    assert {".gitattributes", "README.md", *FILES} - set(files) == {"settings.json"}
+    assert again.certificate == policy.certificate
+    assert again.sha256 == policy.sha256
+    state = policy.controller.init(jax.random.key(0))
+    given = state, jnp.asarray([0.01, 0.0]), jnp.asarray([1.0, 0.2]), jnp.zeros((6, 2))
+    first, second = (
+        jax.jit(each.controller.act)(each.params, *given)[0] for each in (policy, again)
+    )
+    np.testing.assert_array_equal(first, second)
+    assert "under: mass [kg] 0.8 to 1.2" in files["README.md"].decode()
 
 
 def test_starts_come_back_if_the_controls_allow_it(certified):

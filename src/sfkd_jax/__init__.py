@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sfkd_jax.systems import simulated as simulated
     from sfkd_jax.systems import tracking as tracking
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _LAZY = {
     "load": "policy",

@@ -19,12 +19,14 @@ from sfkd_jax.driving.path_following import in_the_world
 from sfkd_jax.driving.plants import FRICTION, roles_of
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.policy._calling import entrance, with_capacity
-from sfkd_jax.policy._certificate import CERTIFICATE as CERTIFICATE
-from sfkd_jax.policy._certificate import RECORDED as RECORDED
 from sfkd_jax.policy._certificate import SavedHashes, save_certificate
 from sfkd_jax.policy._certificate import read_certificate as read_certificate
 from sfkd_jax.policy._description import describe, interface_of
-from sfkd_jax.policy._shipped import POLICY_FILE
+from sfkd_jax.policy._files import CERTIFICATE as CERTIFICATE
+from sfkd_jax.policy._files import POLICY_FILE
+from sfkd_jax.policy._files import RECORDED as RECORDED
+from sfkd_jax.policy._hub import Shareable as Shareable
+from sfkd_jax.policy._hub import located
 from sfkd_jax.policy._shipped import SHIPPED as SHIPPED
 from sfkd_jax.policy._shipped import ShippedPolicy as ShippedPolicy
 from sfkd_jax.policy._shipped import policies as policies
@@ -54,7 +56,7 @@ from sfkd_jax.types import Controller, Params
 
 
 @dataclass(frozen=True, eq=False)
-class Policy(TrainedModel):
+class Policy(TrainedModel, Shareable):
     """A trained controller, as `load` returns it; `params` are folded for it.
 
     Attributes:
@@ -208,8 +210,9 @@ def load(
     `certify_system` has made it returns a `SystemPolicy`.
 
     Args:
-        path: path of the directory or of a policy.safetensors, or the name of a policy
-            that ships, see `policies`.
+        path: path of the directory or of a policy.safetensors, the name of a policy
+            that ships, see `policies`, or the address of one on the Hugging Face Hub,
+            "hf://owner/name" or "hf://owner/name@revision".
         controller: settings of a controller to build instead of the saved one.
         env_source: one of `assembly.ENV_SOURCES`. "estimated" for a policy in path
             coordinates that estimates the environment and ignores the one it is given;
@@ -225,10 +228,11 @@ def load(
 
     Raises:
         ArtefactError: as `restore`, or a certificate that does not hold, or one that
-            `signed_by` has not signed.
+            `signed_by` has not signed, or there is no policy at an address.
         ValueError: `controller`, `env_source` or `latency` does not fit the policy, or
             an estimate is asked of a policy that is not in path coordinates.
     """
+    path = located(path)
     if is_system(path):
         if controller or latency or adaptive or signed_by or env_source != "measured":
             raise ValueError(f"{path} is the policy of a system: load it by path alone")
@@ -267,7 +271,7 @@ def _load_vehicle(
     unchanged = controller is None and latency is None
     as_saved = unchanged and env_source == "measured" and not adaptive
     with store.as_artefact_error(file, ValueError) if as_saved else nullcontext():
-        latency = _latency_of(trained, certificate, latency)
+        compensated = _latency_of(trained, certificate, latency)
         around = partial(
             assembly.build_controller,
             settings["controller"],
@@ -279,9 +283,11 @@ def _load_vehicle(
             certificate=certificate,
             law=trained.law,
             adaptive=adaptive,
-            latency=latency,
+            latency=compensated,
         )
         planner = around()
+    # What the certificate states is not added: it is bound to the settings as they are.
+    settings = settings if latency is None else _stating(settings, compensated)
     signature = "unsigned"
     if certificate is not None:
         signature = describe_signature(certificate.sha256, certificate.signature)
@@ -289,12 +295,12 @@ def _load_vehicle(
         # 4: `load` and `policy_numerics` stand between this function and the caller.
         warnings.warn(f"{file}: nothing is certified; {reason}", stacklevel=4)
     return Policy(
-        **vars(replace(trained, settings=_stating(settings, latency))),
+        **vars(replace(trained, settings=settings)),
         controller=entrance(planner, trained),
         certificate=certificate,
         signature=signature,
         around=around,
-        latency=latency,
+        latency=compensated,
     )
 
 
@@ -332,14 +338,19 @@ def _driving_settings(
 ) -> dict[str, Any]:
     """Return the saved settings with the controller and the source of e to drive with.
 
+    As loaded without options they are those of the file, to which a signature refers.
+
     Args:
         saved: the settings in the file of the policy.
         controller: settings of a controller in place of the saved one, or None.
         env_source: one of `assembly.ENV_SOURCES`.
     """
+    environment = saved["environment"]
+    if env_source != environment.get("source", "measured"):
+        environment = {**environment, "source": env_source}
     return {
         **saved,
-        "environment": {**saved["environment"], "source": env_source},
+        "environment": environment,
         "controller": controller or saved["controller"],
     }
 

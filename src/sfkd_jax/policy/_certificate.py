@@ -11,18 +11,12 @@ from sfkd_jax import certificate as certificates
 from sfkd_jax import store
 from sfkd_jax.certificate import Refusal
 from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.policy._files import CERTIFICATE, RECORDED
 from sfkd_jax.policy._trained import TrainedModel, policy_file
 from sfkd_jax.systems import SystemCertificate
 
 Certified: TypeAlias = DrivingCertificate | SystemCertificate
 """The certificate of a policy."""
-
-CERTIFICATE = "certificate.json"
-"""The certificate in a run directory."""
-RECORDED = "certificate.runs.json"
-"""The certificate with the corridor of recorded runs; it is read in place of the other
-where both exist.
-"""
 
 
 class SavedHashes(NamedTuple):

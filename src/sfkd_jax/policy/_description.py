@@ -16,6 +16,7 @@ from sfkd_jax.driving.plants import axes
 from sfkd_jax.latency import Latency
 from sfkd_jax.policy._trained import TrainedModel
 from sfkd_jax.ranges import in_words
+from sfkd_jax.systems import SystemCertificate, Tracked
 
 
 def interface_of(
@@ -80,7 +81,7 @@ def describe(
         [control["low"] for control in interface["controls"]],
         [control["high"] for control in interface["controls"]],
     )
-    source = trained.settings["environment"]["source"]
+    source = trained.settings["environment"].get("source", "measured")
     box = interface["environment"]
     lines = [
         f"Policy of {vehicle.name} {frame}, a step of {vehicle.dt:g} s",
@@ -171,7 +172,43 @@ def _corridor_conditions(conditions: Conditions, env_names: list[str]) -> str:
     box = in_words(
         ["speed [m/s]", *env_names], [slowest, *env_low], [fastest, *env_high]
     )
-    shortest, longest = conditions.dwell_s
-    dwell = f"{shortest:g} to {longest:g} s"
+    dwell = _span(conditions.dwell_s)
     bend = conditions.peak_curvature
     return f"under: {box}, each for {dwell}; curvature [1/m] {-bend:g} to {bend:g}"
+
+
+def describe_controlled(tracked: Tracked, certificate: SystemCertificate) -> str:
+    """Return what is controlled in a system, what is certified, and where.
+
+    Args:
+        tracked: the system and what it follows.
+        certificate: its verified certificate.
+    """
+    system = tracked.system
+    tubes = certificate.tubes
+    conditions = tubes.conditions
+    env = in_words(system.environment, *conditions.env_box)
+    inputs = in_words(tracked.frame.input_names, *conditions.input_box)
+    lines = [
+        f"SystemPolicy of {system.name}, {1.0 / system.dt:g} Hz",
+        f"states: {', '.join(state.label for state in system.state_variables)}",
+        f"controls: {', '.join(system.controls)}",
+        f"reference: {', '.join(tracked.frame.followed)}",
+        f"proved: contracts at {certificate.proof.alpha:.4f} a step",
+        f"under: {env}, each for {_span(conditions.env_dwell_s)}; "
+        f"{inputs}, each for {_span(conditions.reference_dwell_s)}",
+    ]
+    units = tracked.model_frame.units
+    for name, bounds in tubes.outputs.items():
+        lines.append(
+            f"measured, {100 * tubes.level:g} % of runs of "
+            f"{conditions.duration_s:g} s: |{name}| <= {bounds.total:.4g} "
+            f"{units[name]} ({bounds.tube:.4g} tube, {bounds.nominal:.4g} nominal)"
+        )
+    return "\n  ".join(lines)
+
+
+def _span(seconds: tuple[float, float]) -> str:
+    """Return a range of times, as in "3 to 6 s"."""
+    shortest, longest = seconds
+    return f"{shortest:g} to {longest:g} s"

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from sfkd_jax import store
 from sfkd_jax.certificate import read
 from sfkd_jax.driving.certificate import DrivingCertificate
+from sfkd_jax.policy._files import CERTIFICATE, POLICY_FILE
 
 SHIPPED = Path(__file__).parents[1] / "pretrained"
 """A folder for each shipped policy, as `train` wrote it."""
-POLICY_FILE = f"policy{store.SUFFIX}"
-"""Name of the file of weights, law and settings in a run directory."""
 
 
 class ShippedPolicy(NamedTuple):
@@ -52,7 +50,7 @@ def shipped_names() -> list[str]:
 
 def _summary(folder: Path) -> ShippedPolicy:
     """Read the summary of one policy from its certificate."""
-    certificate = read(folder / "certificate.json", DrivingCertificate)
+    certificate = read(folder / CERTIFICATE, DrivingCertificate)
     assert isinstance(certificate, DrivingCertificate)
     env_low, env_high = certificate.measured.boxes.env
     corridor = certificate.corridor

@@ -14,7 +14,10 @@ import numpy as np
 from sfkd_jax import certificate as certificates
 from sfkd_jax import control, models, store
 from sfkd_jax.certificate import Refusal
-from sfkd_jax.policy._certificate import CERTIFICATE, SavedHashes, save_certificate
+from sfkd_jax.policy._certificate import SavedHashes, save_certificate
+from sfkd_jax.policy._description import describe_controlled
+from sfkd_jax.policy._files import CERTIFICATE, SYSTEM_FILE
+from sfkd_jax.policy._hub import Shareable
 from sfkd_jax.policy._trained import (
     LAW,
     arrays_of,
@@ -38,8 +41,6 @@ from sfkd_jax.systems import (
 )
 from sfkd_jax.types import Control, Controller, Environment, Model, Params, Space, State
 
-FILE = "system.safetensors"
-"""The policy of a system in its run directory."""
 SYSTEM_KIND = "system"
 """The kind of artefact that its manifest states."""
 
@@ -66,7 +67,7 @@ class TrainedSystem:
 
 
 @dataclass(frozen=True, eq=False)
-class SystemPolicy(TrainedSystem):
+class SystemPolicy(TrainedSystem, Shareable):
     """A controller of a system with its certificate, as `load` returns it.
 
     Attributes:
@@ -156,24 +157,7 @@ class SystemPolicy(TrainedSystem):
 
     def __repr__(self) -> str:
         """Say what is controlled, what is certified, and where."""
-        system = self.loop.tracked.system
-        tubes = self.certificate.tubes
-        lines = [
-            f"SystemPolicy of {system.name}, {1.0 / system.dt:g} Hz",
-            f"  states: {', '.join(s.label for s in system.state_variables)}",
-            f"  controls: {', '.join(system.controls)}",
-            f"  e: {', '.join(system.environment)}",
-            f"  reference: {', '.join(self.reference_names)}",
-            f"  proved: contracts at {self.certificate.proof.alpha:.4f} a step",
-        ]
-        units = self.model.frame.units
-        for name, bounds in tubes.outputs.items():
-            lines.append(
-                f"  measured, {100 * tubes.level:g} % of runs of "
-                f"{tubes.conditions.duration_s:g} s: |{name}| <= {bounds.total:.4g} "
-                f"{units[name]} ({bounds.tube:.4g} tube, {bounds.nominal:.4g} nominal)"
-            )
-        return "\n".join(lines)
+        return describe_controlled(self.loop.tracked, self.certificate)
 
 
 def describe_system(tracked: Tracked) -> dict[str, Any]:
@@ -215,7 +199,7 @@ def system_model(tracked: Tracked, space: Space, settings: Values) -> Model:
 
 def system_file(path: str | Path) -> Path:
     """Return the file of the policy in the run directory of a system."""
-    return Path(path) / FILE
+    return Path(path) / SYSTEM_FILE
 
 
 def is_system(path: str | Path) -> bool:

@@ -16,7 +16,8 @@ import numpy as np
 from sfkd_jax import assembly, store
 from sfkd_jax.driving.path_following import PathLaw, law_from_arrays
 from sfkd_jax.driving.plants import Vehicle
-from sfkd_jax.policy._shipped import POLICY_FILE, SHIPPED, shipped_names
+from sfkd_jax.policy._files import POLICY_FILE
+from sfkd_jax.policy._shipped import SHIPPED, shipped_names
 from sfkd_jax.settings import Values
 from sfkd_jax.types import Controller, Model, Params
 
