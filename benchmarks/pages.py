@@ -685,6 +685,7 @@ def margins():
 
 DRIVERS = {
     "lane": "the policy in its lane",
+    "lane, reversing": "the same in a car that reverses",
     "oracle": "MPPI that knows the car",
     "oracle in the guard": "MPPI that knows the car, in the shield",
 }
@@ -701,8 +702,14 @@ SITUATIONS = {
 def lane():
     """Obstacles that are seen late: what each system hits, and how fast it is."""
     rows = [row for row in read("benchmarks/lane.json") if "collisions" in row]
-    order = list(SITUATIONS)
-    rows.sort(key=lambda row: (order.index(row["row"]), row["car"]))
+    situations = list(SITUATIONS)
+    drivers = list(DRIVERS)
+
+    def order(row):
+        driver = drivers.index(row["system"])
+        return situations.index(row["row"]), row["car"], driver
+
+    rows.sort(key=order)
     lines = []
     for row in rows:
         texts = (

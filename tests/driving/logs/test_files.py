@@ -1,6 +1,7 @@
 """Recorded runs are read without loss, implausible ones refused in one line."""
 
 import re
+import zipfile
 
 import numpy as np
 import pyarrow
@@ -470,6 +471,16 @@ def test_a_malformed_file_is_one_line_with_its_place(tmp_path, kind):
     else:
         (tmp_path / "a.csv").write_text(content)
         assert refusal(tmp_path / "a.csv") == f"{tmp_path / 'a.csv'}{message}"
+
+
+def test_an_array_that_no_memory_holds_is_one_line(tmp_path):
+    """A header may claim any size: 500 bytes, 73 TiB."""
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**13,)}
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name in NAMES:
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array_header_1_0(entry, header)
+    assert "a.npz: not a readable npz file (Unable to" in refusal(tmp_path / "a.npz")
 
 
 def test_every_refused_file_is_reported(tmp_path):
