@@ -128,6 +128,8 @@ class InLane(Stateful):
             because a law follows a falling speed that much later.
         better: relative gain at which a reference replaces the committed one.
         trial: number of steps without a claim after an evasion.
+        candidates: number of references that are drawn as the search draws them, to be
+            shown in `info.lane.candidates` beside the ways round; 0 for none.
     """
 
     inner: Controller
@@ -142,6 +144,7 @@ class InLane(Stateful):
     lead: NonNegative = 0.0
     better: NonNegative = 0.01
     trial: AtLeastOne = 20
+    candidates: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -195,6 +198,9 @@ class InLane(Stateful):
             return state.planner, situation.committed, jnp.asarray(False)
 
         planner, committed, taken = jax.lax.cond(due, search, keep)
+        candidates = None
+        if self.candidates:
+            candidates = task.candidates(situation, state.planner, self.candidates)
         judged = task.judge(weights, situation, committed)
         # An admissible reference stays admissible. A last resort need not be, until the
         # car stands.
@@ -223,6 +229,7 @@ class InLane(Stateful):
                 evading=evading,
                 waiting=jnp.any(~judged.curve.reached & (situation.road.wanted > 0.0)),
                 reversing=jnp.asarray(False),
+                candidates=candidates,
             ),
         )
         wait = jnp.where(due, self.period, state.wait) - 1
