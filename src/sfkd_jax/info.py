@@ -256,8 +256,8 @@ class Candidates(NamedTuple):
         admissible: which of them could be committed, (candidate,).
     """
 
-    position: Float[Array, "candidate 2 point"]
-    admissible: Bool[Array, " candidate"]
+    position: Float[Array, "*candidate 2 point"]
+    admissible: Bool[Array, "*candidate"]
 
 
 class LaneInfo(NamedTuple):

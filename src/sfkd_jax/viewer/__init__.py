@@ -5,5 +5,6 @@ from sfkd_jax.viewer._live_drive import LiveState as LiveState
 from sfkd_jax.viewer._live_drive import Moment as Moment
 from sfkd_jax.viewer._live_drive import Wishes as Wishes
 from sfkd_jax.viewer._live_drive import live_drive as live_drive
-from sfkd_jax.viewer._server import open_server as open_server
+from sfkd_jax.viewer._panel import Panel as Panel
+from sfkd_jax.viewer._server import served as served
 from sfkd_jax.viewer._server import show as show

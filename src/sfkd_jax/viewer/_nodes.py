@@ -32,6 +32,12 @@ LOOK_AT = (9.0, 0.0, 0.0)
 """What it looks at [m]."""
 FIELD_OF_VIEW = 0.85
 """Of the camera [rad]."""
+AMBIENT = 2.2
+"""Intensity of the light from everywhere."""
+SUN = 1.4
+"""Intensity of the light from one side."""
+SUN_AT = (-20.0, 30.0, 40.0)
+"""Where that comes from."""
 GROUND = 400.0
 """Half of the side of the ground [m]."""
 HEIGHTS = {
@@ -70,6 +76,12 @@ class Nodes:
             wishes: with the first places of the obstacles.
         """
         self.scene = server.scene
+        self.drawn: dict[str, Any] = {}
+        # The lights of viser make everything nearly white.
+        self.scene.configure_default_lights(False)
+        self.scene.configure_environment_map(None)
+        self.scene.add_light_ambient("/ambient", intensity=AMBIENT)
+        self.scene.add_light_directional("/sun", intensity=SUN, position=SUN_AT)
         server.initial_camera.position = CAMERA
         server.initial_camera.look_at = LOOK_AT
         server.initial_camera.fov = FIELD_OF_VIEW
@@ -80,7 +92,6 @@ class Nodes:
             for number, place in enumerate(wishes.obstacles)
         ]
         self.friction = float("nan")
-        self.changing: dict[str, Any] = {}
 
     def _draw_road(self, lane: Lane) -> Any:
         """Draw ground, surface, edges and middle of the road; return the surface."""
@@ -92,9 +103,10 @@ class Nodes:
         right = beside(points, -np.asarray(lane.right))
         road = HEIGHTS["road"]
         surface = self._draw_mesh("road", strip(left, right, road), "white")
+        marking = HEIGHTS["marking"]
         for name, edge in (("left", left), ("right", right)):
-            self._draw_line(name, pieces(edge, road), style.DARK, 0.12)
-        middle = pieces(beside(points), HEIGHTS["marking"])
+            self._draw_line(name, pieces(edge, marking), style.DARK, 0.12)
+        middle = pieces(beside(points), marking)
         dashes = np.arange(len(middle)) % DASH < DASH // 2
         self._draw_line("middle", middle[dashes], style.MARKING, 0.12)
         return surface
@@ -104,18 +116,18 @@ class Nodes:
         name = f"{WORLD}/obstacle_{number}"
         control = self.scene.add_transform_controls(
             name,
-            scale=2.5,
+            scale=4.0,
             active_axes=(True, True, False),
             disable_rotations=True,
             depth_test=False,
-            position=(*place, 0.0),
+            position=(*place, OBSTACLE_HEIGHT),
         )
         self.scene.add_cylinder(
             f"{name}/body",
             radius=RADIUS,
             height=OBSTACLE_HEIGHT,
             color=rgb(style.SOFT),
-            position=(0.0, 0.0, 0.5 * OBSTACLE_HEIGHT),
+            position=(0.0, 0.0, -0.5 * OBSTACLE_HEIGHT),
         )
         return control
 
@@ -126,7 +138,7 @@ class Nodes:
     def place(self, obstacles: Float[np.ndarray, "obstacle 2"]) -> None:
         """Put the obstacles somewhere else [m]."""
         for control, place in zip(self.controls, obstacles, strict=True):
-            control.position = (*place, 0.0)
+            control.position = (*place, OBSTACLE_HEIGHT)
 
     def draw(self, moment: Moment, wishes: Wishes) -> None:
         """Draw what changes from one control step to the next, but for the car.
@@ -178,8 +190,8 @@ class Nodes:
         if edges is not None:
             mesh = strip(*edges, HEIGHTS["corridor"])
             self._draw_mesh("corridor", mesh, style.ACCENT, 0.45)
-        if "corridor" in self.changing:
-            self.changing["corridor"].visible = edges is not None
+        if "corridor" in self.drawn:
+            self.drawn["corridor"].visible = edges is not None
 
     def _draw_candidates(self, moment: Moment) -> None:
         """Draw references that the planner considers, by whether it may commit them."""
@@ -202,7 +214,7 @@ class Nodes:
         along, aside, above = ARROW_AT
         length = ARROW * wind
         ends = [[along, aside - s * length, above] for s in (0.5, -0.5)]
-        arrow = self.changing.get("wind")
+        arrow = self.drawn.get("wind")
         if arrow is None:
             arrow = self.scene.add_arrows(
                 "/wind",
@@ -212,7 +224,7 @@ class Nodes:
                 head_radius=0.22,
                 head_length=0.6,
             )
-            self.changing["wind"] = arrow
+            self.drawn["wind"] = arrow
         arrow.points = np.array([ends], dtype=np.float32)
         arrow.visible = abs(wind) > 0.1
 
@@ -221,7 +233,7 @@ class Nodes:
     ) -> Any:
         """Draw a mesh in the world in place of the one of the same name; return it."""
         vertices, faces = mesh
-        node = self.changing.get(name)
+        node = self.drawn.get(name)
         if node is not None and node.faces.shape == faces.shape:
             node.vertices = vertices.astype(np.float32)
             return node
@@ -235,7 +247,7 @@ class Nodes:
             side="double",
             cast_shadow=False,
         )
-        self.changing[name] = node
+        self.drawn[name] = node
         return node
 
     def _draw_line(
@@ -246,11 +258,11 @@ class Nodes:
         width: float,
     ) -> None:
         """Draw segments in the world in place of those of the same name."""
-        node = self.changing.get(name)
+        node = self.drawn.get(name)
         if node is not None:
             node.points = segments.astype(np.float32)
             return
-        self.changing[name] = self.scene.add_line_segments(
+        self.drawn[name] = self.scene.add_line_segments(
             f"{WORLD}/{name}", segments, rgb(colour), thickness=width
         )
 

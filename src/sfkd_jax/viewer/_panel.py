@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import viser
 
 LEGEND = (
-    (style.ACCENT, "committed reference in its certified corridor"),
-    (style.THIRD, "candidates of the planner that are admissible"),
-    (style.MUTED, "candidates that are not"),
-    (style.SECOND, "kept clear by the middle of the car"),
-    (style.SOFT, "obstacles: drag them along the road"),
+    (style.ACCENT, "reference, in its certified corridor"),
+    (style.THIRD, "admissible candidates"),
+    (style.MUTED, "other candidates of the planner"),
+    (style.SECOND, "not for the middle of the car"),
+    (style.SOFT, "obstacles: drag them"),
 )
 """Colours and what has them."""
 
@@ -98,8 +98,8 @@ def readings(state: LiveState, moment: Moment) -> str:
             "|---|---|",
             f"| speed | {moment.speed:.1f} m/s{standing} |",
             f"| corridor claimed | {claim} |",
-            f"| deviation | {100 * moment.deviation:+.0f} cm |",
-            f"| largest so far | {100 * state.largest:.0f} cm |",
+            f"| deviation | {100 * moment.deviation:+.1f} cm |",
+            f"| largest so far | {100 * state.largest:.1f} cm |",
             f"| to the next obstacle | {moment.gap:.1f} m |",
             f"| nearest so far | {state.nearest:.2f} m |",
             f"| time | {state.time:.0f} s |",

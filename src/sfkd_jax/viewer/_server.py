@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import socket
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.viewer._live_drive import LiveDrive
+from sfkd_jax.viewer._live_drive import LiveDrive, Wishes
 from sfkd_jax.viewer._nodes import Nodes
 from sfkd_jax.viewer._panel import Panel
 
@@ -23,14 +26,15 @@ DRAWN = 3
 """How often the car is drawn in a control step."""
 
 
-def open_server(port: int) -> viser.ViserServer:
-    """Return a server of pages; its `stop` closes it.
+@contextmanager
+def served(port: int) -> Iterator[viser.ViserServer]:
+    """Serve an empty page, until the context ends.
 
     Args:
         port: 0 for any that is free.
 
     Raises:
-        ValueError: the package viser is missing, or the port is in use.
+        ValueError: the package viser is missing, or the port cannot be used.
     """
     try:
         import viser
@@ -47,7 +51,18 @@ def open_server(port: int) -> viser.ViserServer:
             raise ValueError(
                 f"demo.port={port} cannot be used: {reason.strerror}; choose another"
             ) from reason
-    return viser.ViserServer(host=HOST, port=port, label="sfkd_jax", verbose=False)
+    with _quiet():
+        server = viser.ViserServer(HOST, port, label="sfkd_jax", verbose=False)
+    try:
+        yield server
+    finally:
+        with _quiet():
+            server.stop()
+
+
+def _quiet() -> redirect_stdout:
+    """Keep what viser prints off stdout, whose last line is a JSON document."""
+    return redirect_stdout(io.StringIO())
 
 
 def address(server: viser.ViserServer) -> str:
@@ -59,24 +74,27 @@ def show(
     server: viser.ViserServer,
     drive: LiveDrive,
     *,
+    wishes: Wishes | None = None,
     steps: int | None = None,
     seed: int = 0,
-    started: Any = None,
+    started: Callable[[str, Panel], None] | None = None,
 ) -> dict[str, Any]:
     """Drive and draw in real time, until Ctrl-C.
 
     Args:
         server: of the page.
         drive: that is shown.
+        wishes: at the start; by default `LiveDrive.first_wishes`.
         steps: number of control steps after which it ends; None for no end.
         seed: of the noise of the sensors and of the planner.
-        started: called with the address once the car drives.
+        started: called with the address and the panel before the first step.
 
     Returns:
-        Address of the page, number of control steps, and largest deviation since the
-        last restart [m].
+        Address of the page, number of control steps, and since the last restart the
+        time [s] and the largest deviation [m].
     """
-    wishes = drive.first_wishes
+    wishes = wishes or drive.first_wishes
+    first = wishes.obstacles
     nodes = Nodes(server, drive.lane, wishes)
     panel = Panel(server, drive, wishes)
     half = drive.policy.vehicle.size.half
@@ -85,7 +103,7 @@ def show(
     # The first step compiles; the car stays where it is.
     _, before = drive.step(state, wishes)
     if started is not None:
-        started(address(server))
+        started(address(server), panel)
     done = 0
     due = time.monotonic()
     try:
@@ -93,6 +111,7 @@ def show(
             due = max(due + drive.dt, time.monotonic())
             if panel.restarted.is_set():
                 panel.restarted.clear()
+                nodes.place(first)
                 state = start
                 _, before = drive.step(state, wishes)
             wishes = panel.wishes(nodes.obstacles())
@@ -118,6 +137,7 @@ def show(
     return {
         "address": address(server),
         "steps": done,
+        "driven_s": state.time,
         "max_deviation_m": state.largest,
     }
 

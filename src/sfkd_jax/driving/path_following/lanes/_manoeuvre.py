@@ -230,12 +230,12 @@ class Manoeuvres:
         drawn = planner.plan + planner.tuning.noise_std * noise
         rows = jnp.concatenate([drawn, self.ways_round(situation)])
 
-        def judged(row: Control) -> Judged:
+        def candidate(row: Control) -> Candidates:
             reference = self.reference(situation, row)
-            return self.judge(planner.tuning.cost, situation, reference)
+            judged = self.judge(planner.tuning.cost, situation, reference)
+            return Candidates(judged.curve.position, judged.violation <= 0.0)
 
-        all_judged = jax.vmap(judged)(rows)
-        return Candidates(all_judged.curve.position, all_judged.violation <= 0.0)
+        return jax.vmap(candidate)(rows)
 
     def _ahead(
         self, situation: Situation
