@@ -26,7 +26,7 @@ from sfkd_jax.driving.path_following.lanes._reference import (
     window,
 )
 from sfkd_jax.driving.paths import SPACING, Lap, Path, point_at, project
-from sfkd_jax.info import ControllerInfo, LaneInfo, Reason
+from sfkd_jax.info import Candidates, ControllerInfo, LaneInfo, Reason
 from sfkd_jax.ranges import (
     AtLeastOne,
     NonNegative,
@@ -198,9 +198,6 @@ class InLane(Stateful):
             return state.planner, situation.committed, jnp.asarray(False)
 
         planner, committed, taken = jax.lax.cond(due, search, keep)
-        candidates = None
-        if self.candidates:
-            candidates = task.candidates(situation, state.planner, self.candidates)
         judged = task.judge(weights, situation, committed)
         # An admissible reference stays admissible. A last resort need not be, until the
         # car stands.
@@ -229,13 +226,19 @@ class InLane(Stateful):
                 evading=evading,
                 waiting=jnp.any(~judged.curve.reached & (situation.road.wanted > 0.0)),
                 reversing=jnp.asarray(False),
-                candidates=candidates,
+                candidates=self._shown(situation, state.planner),
             ),
         )
         wait = jnp.where(due, self.period, state.wait) - 1
         started = state.started | all_finite(observation)
         after = LaneState(inner, planner, committed, progress, wait, started, doubt)
         return control, after, info
+
+    def _shown(self, situation: Situation, planner: Any) -> Candidates | None:
+        """Return candidates of a search, from its state before; None for none."""
+        if not self.candidates:
+            return None
+        return self.manoeuvres.candidates(situation, planner, self.candidates)
 
     def _window(
         self, path: Path, situation: Situation, committed: Committed, judged: Judged
