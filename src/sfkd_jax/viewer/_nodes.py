@@ -1,7 +1,9 @@
 """What the browser shows of a drive: road, car, corridor, obstacles and candidates.
 
 The road moves below a camera that stands still, so that whoever looks may turn the view
-while the car drives.
+while the car drives. Reference, corridor and what is kept clear are those of the
+`LaneScene`. Obstacles are bodies that are dragged, and the car is drawn several times
+in a step, with the outlines that the scene has.
 """
 
 from __future__ import annotations
