@@ -87,6 +87,9 @@ APPLICATIONS = {
     | {"assembly", "evaluation", "driving.simulation", "store"}
     | {"certificate", "driving.certificate"}
     | {"policy", "settings", "systems"},
+    "viewer": ROAD
+    | {"driving.certificate", "driving.plants", "driving.scenarios"}
+    | {"driving.simulation", "policy", "report"},
     "__init__": {"export", "geometry", "info", "latency", "policy", "store", "systems"},
 }
 """What puts the floors together."""
@@ -128,6 +131,7 @@ THIRD_PARTY = {
     "driving.corridor": {"numpy", "scipy"},
     "paper": {"numpy"},
     "report": {"numpy", "pandas", "matplotlib", "PIL", "jinja2"},
+    "viewer": {"numpy", "matplotlib", "viser"},
     "policy": {"huggingface_hub", "numpy"},
     "assembly": {"numpy"},
     "adapters": {"brax", "gymnasium", "matplotlib", "numpy", "scipy", "vehiclemodels"},
@@ -140,8 +144,8 @@ HEAVY = {
     *("optax", "pandas", "scipy", "pyarrow", "pint"),
 }
 """What `import sfkd_jax.control` does not load."""
-FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels", "huggingface_hub"}
-"""What is loaded when its adapter, or the Hub, is asked for."""
+FOREIGN = {"brax", "mujoco", "gymnasium", "vehiclemodels", "huggingface_hub", "viser"}
+"""What is loaded when its adapter, the Hub or the page of a drive is asked for."""
 
 LONGEST_FILE = 400
 """Lines of a file of src, docstrings included."""
@@ -174,6 +178,7 @@ LIBRARY = [
 ]
 """Files below the commands."""
 COMPILES = {"rollout", "policy", "training", "certification", "export", "data"}
+COMPILES |= {"viewer"}
 COMPILES |= {"systems", "tubes", "driving.corridor", "driving.drives", "driving.logs"}
 """Packages that run on the host, and may call `jax.jit`; so may gymnasium's adapter."""
 
@@ -357,6 +362,7 @@ def test_the_library_leaves_global_settings_alone():
         ("control", HEAVY | FOREIGN),
         ("policy", HEAVY - {"pandas"} | FOREIGN),
         ("adapters", FOREIGN),
+        ("viewer", FOREIGN),
     ],
 )
 def test_a_module_is_imported_without_heavy_dependencies(module, kept_out):

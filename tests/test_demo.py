@@ -1,6 +1,7 @@
 """The demo: shipped policies are evaluated, and beat the nominal model."""
 
 import json
+import socket
 
 import pytest
 from composing import run
@@ -45,4 +46,19 @@ def test_a_vehicle_without_a_shipped_policy_is_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match="controllers ship for ") as refusal:
         demo.main(run("vehicle.mass=900.0", f"root={tmp_path}"))
     assert "\n" not in str(refusal.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_viewer_refuses_before_anything_is_compiled(tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=rf"demo\.port={port} cannot be used"):
+            demo.main(run("viewer=true", f"demo.port={port}", f"root={tmp_path}"))
+    body = ("+experiment=s3_body", "viewer=true", "demo.port=0")
+    with pytest.raises(ValueError, match="has no certified corridor"):
+        demo.main(run(*body, f"root={tmp_path}"))
+    with pytest.raises(ValueError, match=r"demo\.port"):
+        run("demo.port=70000")
     assert list(tmp_path.iterdir()) == []

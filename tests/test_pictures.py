@@ -62,6 +62,10 @@ MAKERS = {
         "benchmarks/recovery.json",
         recovery_figures.basin,
     ),
+    "viewer.png": Maker(
+        "python -m experiments.viewer_page",
+        "src/sfkd_jax/pretrained/kinematic_path",
+    ),
 }
 """Picture below docs/ -> its maker."""
 WRITTEN_BY_HAND = {"certificate.svg", "commands.svg", "control-step.svg"}

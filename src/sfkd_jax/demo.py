@@ -1,4 +1,7 @@
-"""Drive a policy that ships with the package; nothing is trained."""
+"""Drive a policy that ships with the package; nothing is trained.
+
+With `viewer=true` it drives in its lane, live in a browser.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any, cast
 
-from sfkd_jax import assembly, policy, store
+from sfkd_jax import assembly, policy, store, viewer
 from sfkd_jax.assembly import VehicleSettings
 from sfkd_jax.experiment import evaluating, run_directory
 from sfkd_jax.experiment.command import hydra_command
@@ -22,13 +25,39 @@ PRINTED = ("rmse_m", "max_deviation_m", "smoothness_rad_per_s")
 
 
 def main(run: Run) -> dict[str, Any]:
-    """Simulate a shipped policy beside nominal and oracle; print a table, animate."""
-    began = time.perf_counter()
+    """Simulate a shipped policy beside nominal and oracle, or show it live."""
     settings = run.settings
     name = settings.vehicle.name
     shipped = f"{name}_path" if run.source.along_path else name
+    if settings.viewer:
+        return _show(settings, shipped)
+    return _compare(run, shipped)
+
+
+def _show(settings: Settings, shipped: str) -> dict[str, Any]:
+    """Show a shipped policy in its lane until Ctrl-C."""
+    # Before minutes of compiling: the package may be missing, or the port in use.
+    with viewer.served(settings.demo.port) as server:
+        drive = viewer.live_drive(_load(settings, shipped))
+        store.print_message("compiling the control step: minutes, the first time")
+        return viewer.show(server, drive, seed=settings.seed, started=_print_address)
+
+
+def _print_address(address: str, _: viewer.Panel) -> None:
+    """Say where the page is."""
+    store.print_message(f"live at {address} until Ctrl-C")
+
+
+def _compare(run: Run, shipped: str) -> dict[str, Any]:
+    """Simulate a shipped policy beside nominal and oracle; print a table, animate."""
+    began = time.perf_counter()
+    settings = run.settings
     trained = _load(settings, shipped)
-    protocol = replace(settings.evaluation, **vars(settings.demo))
+    protocol = replace(
+        settings.evaluation,
+        episodes=settings.demo.episodes,
+        episode_s=settings.demo.episode_s,
+    )
     settings = replace(settings, name="demo", evaluation=protocol)
     run = Run(settings, run.source)
     episodes = evaluating.make_episodes(run)

@@ -248,6 +248,18 @@ class ShieldInfo(NamedTuple):
     rolling: Scalar
 
 
+class Candidates(NamedTuple):
+    """References like those that a search compares, to be shown.
+
+    Attributes:
+        position: of their points [m], (candidate, 2, point).
+        admissible: which of them could be committed, (candidate,).
+    """
+
+    position: Float[Array, "*candidate 2 point"]
+    admissible: Bool[Array, "*candidate"]
+
+
 class LaneInfo(NamedTuple):
     """The reference that `path_following.InLane` chose.
 
@@ -263,6 +275,7 @@ class LaneInfo(NamedTuple):
         evading: whether it is outside the class.
         waiting: whether it ends at rest before something that is in the way.
         reversing: whether it goes backwards, away from that, see `Reversing`.
+        candidates: that were drawn to be shown; None where none were asked for.
     """
 
     reference: Float[Array, "horizon 4"]
@@ -274,6 +287,7 @@ class LaneInfo(NamedTuple):
     evading: Flag
     waiting: Flag = False
     reversing: Flag = False
+    candidates: Candidates | None = None
 
 
 class ControllerInfo(NamedTuple):

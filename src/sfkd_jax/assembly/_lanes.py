@@ -42,6 +42,7 @@ def build_in_lane(
     planner: str,
     friction: int | None,
     reverse: bool = False,
+    candidates: int = 0,
 ) -> Controller:
     """Return a controller that drives in a lane, see `path_following.InLane`.
 
@@ -55,6 +56,7 @@ def build_in_lane(
         planner: that searches for a reference, in `PLANNERS`.
         friction: entry of e that is the friction; None if none is.
         reverse: whether the vehicle reverses where u_2 is below 0 at rest.
+        candidates: see `path_following.InLane`.
     """
     admissible = _admissible_references(plant, law, certificate, car)
     manoeuvres = path_following.Manoeuvres.scaled(admissible, plant.dt)
@@ -80,6 +82,7 @@ def build_in_lane(
         spacing=length * path_following.InLane.spacing,
         lead=0.0 if plant.speed_loop else 1.0 / speed_gain,
         friction=friction,
+        candidates=candidates,
         **grip,
     )
     if not reverse:

@@ -283,15 +283,17 @@ class LatencySettings:
 
 @takes()
 class DemoSettings:
-    """Episodes of `demo`.
+    """Episodes of `demo`, and its page.
 
     Attributes:
         episodes: number of episodes for each system.
         episode_s: length of an episode [s].
+        port: of the page that `viewer` opens; 0 for any that is free.
     """
 
     episodes: int
     episode_s: Seconds
+    port: Annotated[int, Interval("[0, 65535]")]
 
 
 @takes()
@@ -315,6 +317,7 @@ class Settings:
     optimized: bool
     scaled: bool
     system: str | None
+    viewer: bool
     vehicle: VehicleSettings
     environment: EnvironmentSettings
     scenario: ScenarioSettings

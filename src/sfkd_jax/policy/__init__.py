@@ -122,6 +122,7 @@ class Policy(TrainedModel, Shareable):
         planner: str = "mppi",
         capacity: tuple[int, int] | None = None,
         reverse: bool = False,
+        candidates: int = 0,
     ) -> Controller:
         """Return a controller that drives in a lane, round obstacles, see `InLane`.
 
@@ -138,6 +139,8 @@ class Policy(TrainedModel, Shareable):
             reverse: whether the vehicle reverses where u_2 is below 0 at rest. It then
                 backs up where it stands too near to something to turn away, without a
                 claim, see `path_following.Reversing`.
+            candidates: number of references that are drawn as the search draws them, to
+                be shown in `info.lane.candidates`.
 
         Raises:
             ValueError: the policy has no certified corridor.
@@ -161,6 +164,7 @@ class Policy(TrainedModel, Shareable):
                 planner=planner,
                 friction=roles.index(FRICTION) if FRICTION in roles else None,
                 reverse=reverse,
+                candidates=candidates,
             )
         if capacity is not None:
             controller = with_capacity(controller, capacity)

@@ -249,7 +249,7 @@ class Film:
         seen = partial(seen_from, self.path[first])
         around = self.path[max(first - 120, 0) : first + 160]
         for side, dashes in ((-_HALF, "-"), (0.0, (0, (6, 5))), (_HALF, "-")):
-            look: dict[str, Any] = {"color": "#aab1ba", "lw": 1.2, "ls": dashes}
+            look: dict[str, Any] = {"color": style.MARKING, "lw": 1.2, "ls": dashes}
             draw_once(axes, Line2D(*seen(around, side), **look))
         if self.corridor:
             half = self.factor * self.corridor

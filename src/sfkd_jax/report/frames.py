@@ -51,17 +51,25 @@ def rotation_into(yaw: float | np.floating) -> Float[np.ndarray, "2 2"]:
     return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
 
 
-def seen_from(centre: Any, points: Any, offset: Any = 0.0) -> np.ndarray:
-    """Return places beside points, in the frame of a centre, (2, point).
+def beside(points: Any, offset: Any = 0.0) -> np.ndarray:
+    """Return places beside points, (2, point).
 
     Args:
-        centre: (x, y, yaw, …) of the origin of the frame.
         points: (point, column): x, y, yaw, ….
         offset: how far to the left of the points the places are [m].
     """
     left = np.stack([-np.sin(points[:, 2]), np.cos(points[:, 2])])
-    places = points[:, :2].T + offset * left
+    return points[:, :2].T + offset * left
+
+
+def into_view(centre: Any, places: Any) -> np.ndarray:
+    """Return places, (2, point), in the frame of a centre (x, y, yaw, …)."""
     return rotation_into(centre[2]) @ (places - centre[:2, None])
+
+
+def seen_from(centre: Any, points: Any, offset: Any = 0.0) -> np.ndarray:
+    """Return places `beside` points, in the frame of a centre (x, y, yaw, …)."""
+    return into_view(centre, beside(points, offset))
 
 
 def area_between(line: Any, other: Any, **look: Any) -> Polygon:

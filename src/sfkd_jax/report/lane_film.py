@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.text import Text
@@ -23,28 +22,26 @@ from sfkd_jax.report.frames import (
     draw_frames,
     draw_once,
     draw_wind,
-    rotation_into,
+    into_view,
     seen_from,
     surface_colour,
 )
+from sfkd_jax.report.lane_scene import scene_of
 
 _SIGHT = (-8.0, 34.0)
 """What is seen of a lane behind and ahead of the car [m]."""
 _SIDE = 6.6
 """What is seen of a lane to either side of its middle [m]."""
 _OBSTACLE: dict[str, Any] = dict(fc=style.SOFT, ec=style.DARK, lw=0.8)
-_INFLATED: dict[str, Any] = dict(fc=style.SECOND, alpha=0.3, lw=0)
+_NEEDED: dict[str, Any] = dict(fc=style.SECOND, alpha=0.3, lw=0)
 _CORRIDOR: dict[str, Any] = dict(fc=style.ACCENT, alpha=0.45, lw=0)
 _REFERENCE: dict[str, Any] = dict(color=style.ACCENT, lw=0.9)
-_BODY: Any = (
-    (
-        [[1, 0.8], [1, -0.8], [0.9, -1], [-1, -1], [-1, 1], [0.9, 1]],
-        dict(fc="#5b9bd5", ec=style.DARK, lw=1.0),
-    ),
-    ([[0.45, 0.7], [0.45, -0.7], [0.15, -0.6], [0.15, 0.6]], dict(fc=style.DARK)),
-    ([[-0.75, 0.6], [-0.75, -0.6], [-0.6, -0.55], [-0.6, 0.55]], dict(fc=style.DARK)),
+_CAR: Any = (
+    dict(fc=style.CAR, ec=style.DARK, lw=1.0),
+    dict(fc=style.DARK),
+    dict(fc=style.DARK),
 )
-"""Outline, front and rear window of the car, in shares of half its size."""
+"""Looks of the parts of the car."""
 
 
 class LaneFilm:
@@ -65,12 +62,12 @@ class LaneFilm:
         self.spacing = float(lane.path.spacing)
         # To the left of the middle [m].
         self.edges = (np.asarray(lane.left), -np.asarray(lane.right))
-        self.obstacles = [*zip(*map(np.asarray, obstacles), strict=True)]
+        self.obstacles = obstacles
         self.states = np.asarray(episode.states)
-        self.car = np.asarray(car)
+        self.car = car
         self.along = np.append(0.0, episode.progress)
         self.signals = episode.signals
-        self.corridor = np.nan_to_num(episode.signals["corridor"])
+        self.corridor = np.asarray(episode.signals["corridor"])
         # The film begins where the road fills the view: the road begins at the start.
         self.first = int(np.argmax(self.along >= -_SIGHT[0]))
         self.last = min(round(SECONDS / dt), len(self.corridor))
@@ -83,15 +80,16 @@ class LaneFilm:
         figure.set(figwidth=8.0, dpi=100)
         axes = figure.add_axes((0.07, 0.225, 0.92, 0.68))
         axes.set(xlim=_SIGHT, ylim=(-_SIDE, _SIDE), aspect="equal")
-        axes.set_facecolor("#e6e9e2")
+        axes.set_facecolor(style.ROADSIDE)
         axes.set_xlabel("ahead of the car [m]", labelpad=1)
         axes.set_ylabel("left of the middle [m]")
-        corridor = f"certified corridor, ± {self.corridor.min():.2f} m"
+        narrowest = np.nan_to_num(self.corridor).min()
+        corridor = f"certified corridor, ± {narrowest:.2f} m"
         handles = [
             Line2D([], [], **_REFERENCE, label="committed reference"),
             Polygon([[0, 0]], **_CORRIDOR, label=corridor),
             Polygon([[0, 0]], **_OBSTACLE, label="obstacle"),
-            Polygon([[0, 0]], **_INFLATED, label="plus half the car and corridor"),
+            Polygon([[0, 0]], **_NEEDED, label="plus half the car and corridor"),
         ]
         figure.legend(
             handles=handles,
@@ -110,22 +108,27 @@ class LaneFilm:
         index, share = divmod(self.along[step] / self.spacing, 1.0)
         first = int(index)
         centre = (1.0 - share) * self.path[first] + share * self.path[first + 1]
-        seen = partial(seen_from, centre)
+        seen = partial(into_view, centre)
         friction, wind = self.envs[step]
-        self._draw_road(axes, seen, first, friction)
-        corridor = self.corridor[step]
-        self._draw_obstacles(axes, seen, corridor)
+        self._draw_road(axes, partial(seen_from, centre), first, friction)
         references = np.asarray(self.signals["reference"])
         # What it has followed, and what it follows next.
         past = references[max(step - TRAIL, 0) : step, 0]
-        line = np.concatenate([past, references[step]])
-        area = area_between(seen(line, corridor), seen(line, -corridor), **_CORRIDOR)
-        draw_once(axes, area)
-        draw_once(axes, Line2D(*seen(line), **_REFERENCE))
-        turn = rotation_into(centre[2] - state[2])
-        for corners, look in _BODY:
-            body = turn @ (np.array(corners).T * self.car[:, None]) + seen(state[None])
-            draw_once(axes, Polygon(body.T, **look))
+        scene = scene_of(
+            state,
+            np.concatenate([past, references[step]]),
+            float(self.corridor[step]),
+            self.obstacles,
+            half=self.car,
+        )
+        for outlines, look in ((scene.needed, _NEEDED), (scene.obstacles, _OBSTACLE)):
+            for outline in outlines:
+                draw_once(axes, Polygon(seen(outline).T, **look))
+        if scene.corridor is not None:
+            draw_once(axes, area_between(*map(seen, scene.corridor), **_CORRIDOR))
+        draw_once(axes, Line2D(*seen(scene.reference), **_REFERENCE))
+        for part, look in zip(scene.car, _CAR, strict=True):
+            draw_once(axes, Polygon(seen(part).T, **look))
         draw_wind(axes, wind, 0.93 * _SIGHT[1])
         clear = max(float(self.signals["clearance"][step]), 0.0)
         text = "   ".join(
@@ -160,35 +163,5 @@ class LaneFilm:
         draw_once(axes, surface)
         for edge in edges:
             draw_once(axes, Line2D(*edge, color=style.DARK, lw=1.4))
-        middle = Line2D(*seen(road), color="#aab1ba", lw=1.0, ls=(0, (6, 5)))
+        middle = Line2D(*seen(road), color=style.MARKING, lw=1.0, ls=(0, (6, 5)))
         draw_once(axes, middle)
-
-    def _draw_obstacles(self, axes: Any, seen: Any, corridor: Any) -> None:
-        """Draw obstacles, and around them what the car and its corridor need.
-
-        Args:
-            axes: to draw on.
-            seen: (points, offset) -> places in the view.
-            corridor: half width of the corridor [m].
-        """
-        for position, yaw, half, radius, present in self.obstacles:
-            if not present:
-                continue
-            inflated = radius + self.car[1] + corridor
-            for size, look in ((inflated, _INFLATED), (radius, _OBSTACLE)):
-                box = rotation_into(-yaw) @ _rounded(half, size)
-                outline = box + position[0][:, None]
-                places = seen(np.vstack([outline, outline[:1]]).T)
-                draw_once(axes, Polygon(places.T, **look))
-
-
-def _rounded(half: Any, radius: Any) -> Float[np.ndarray, "2 point"]:
-    """Return the outline of a box with round corners around the origin.
-
-    Args:
-        half: half of length and width of the box [m].
-        radius: of the corners, by which the box is larger [m].
-    """
-    angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
-    around = np.stack([np.cos(angle), np.sin(angle)])
-    return radius * around + np.sign(around) * half[:, None]

@@ -18,6 +18,12 @@ MUTED = "#6b7280"
 DARK = "#30363d"
 SOFT = "#57606a"
 AXIS = "#9aa1ab"
+CAR = "#5b9bd5"
+"""Body of a car."""
+MARKING = "#aab1ba"
+"""Lines on a road."""
+ROADSIDE = "#e6e9e2"
+"""Ground beside a road."""
 BAND: dict[str, Any] = dict(fc=ACCENT, alpha=0.16, linewidth=0, zorder=0.5)
 """Look of the area of a certified corridor."""
 EDGE: dict[str, Any] = dict(color=ACCENT, linewidth=1.0, zorder=2)

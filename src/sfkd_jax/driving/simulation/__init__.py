@@ -1,5 +1,9 @@
 """Episodes in closed loop, their metrics, and rows of tables."""
 
+from sfkd_jax.driving.simulation._control_step import ClosedLoop as ClosedLoop
+from sfkd_jax.driving.simulation._control_step import LoopState as LoopState
+from sfkd_jax.driving.simulation._control_step import StepOutcome as StepOutcome
+from sfkd_jax.driving.simulation._control_step import Surroundings as Surroundings
 from sfkd_jax.driving.simulation._loops import Episode as Episode
 from sfkd_jax.driving.simulation._loops import (
     disturbed_environment as disturbed_environment,

@@ -10,20 +10,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sfkd_jax.driving.path_coordinates import LATERAL, curvature_ahead, path_coordinates
-from sfkd_jax.driving.paths import project, reference_window
-from sfkd_jax.driving.plants import Late, LateState, Vehicle, equivalent_wind, late_loop
-from sfkd_jax.driving.scenarios import (
-    Scenario,
-    car_clearance,
-    in_view,
-    random_side_forces,
+from sfkd_jax.driving.paths import reference_window
+from sfkd_jax.driving.plants import Vehicle, equivalent_wind, late_loop
+from sfkd_jax.driving.scenarios import Scenario, in_view, random_side_forces
+from sfkd_jax.driving.simulation._control_step import (
+    ClosedLoop,
+    LoopState,
+    Surroundings,
 )
 from sfkd_jax.driving.simulation.metrics import SIGNALS, Signal
-from sfkd_jax.info import ControllerInfo, reported
 from sfkd_jax.latency import NO_LATENCY, Latency
 from sfkd_jax.ranges import Real
-from sfkd_jax.types import Controller, Key, Params, Reference, Scalar, State, Step
+from sfkd_jax.types import Controller, Key, Params, Scalar, State, Step
 
 FORCE_STREAM = 2
 """Number that is folded into an episode's key for the random side forces. The streams 0
@@ -107,42 +105,27 @@ def simulate(
     planner_key, noise_key = jax.random.split(key)
     recorded = SIGNALS | dict(record or {})
     observed = len(scenario.initial_state)
-    spread = _spread(observation_noise, observed)
     noise_keys = jax.random.split(noise_key, scenario.envs.shape[0])
-    late = late_loop(latency, states=observed, dt=dt)
+    loop = ClosedLoop(
+        plant=plant,
+        controller=controller,
+        late=late_loop(latency, states=observed, dt=dt),
+        spread=_spread(observation_noise, observed),
+        size=None if scenario.course is None else size,
+    )
+    ahead_of = partial(_ahead, scenario, dt=dt, horizon=horizon)
 
     def step(
-        carry: tuple[State, Scalar, Any, LateState], inputs: tuple[Array, Array, Key]
-    ) -> tuple[Any, Any]:
-        state, progress, memory, pending = carry
+        before: LoopState, inputs: tuple[Array, Array, Key]
+    ) -> tuple[LoopState, Any]:
         env, observed_env, sensor_key = inputs
-        shown = state[:observed]
-        arrived, pending = late.observe(pending, jnp.append(shown, progress))
-        # Noise reaches the controller alone, and neither plant nor scores.
-        noise = jax.random.normal(sensor_key, shown.shape)
-        observation = arrived[:-1] + spread * noise
-        ahead = _ahead(scenario, arrived[-1], dt=dt, horizon=horizon)
-        control, memory, info = controller.act(
-            params, memory, observation, observed_env, ahead
-        )
-        info = reported(info)
-        acting, pending = late.actuate(pending, control)
-        state = plant(state, acting, env)
-        # The guess moves on at the reference speed. Where the path crosses itself, the
-        # foot point therefore stays on the right branch.
-        progress, lateral = project(
-            scenario.path, state[:2], progress + scenario.speed * dt
-        )
-        if scenario.course is not None:
-            info, lateral = _on_course(info, ahead, state, lateral, size, late)
-        signals = {name: signal(info) for name, signal in recorded.items()}
-        carry = (state, progress, memory, pending)
-        return carry, (state[:observed], control, lateral, progress, signals)
+        around = Surroundings(env, observed_env, scenario.path, scenario.speed)
+        after, outcome = loop.step(params, before, around, ahead_of, sensor_key)
+        signals = {name: signal(outcome.info) for name, signal in recorded.items()}
+        return after, (*outcome[:-1], signals)
 
     first = scenario.initial_state
-    pending = late.init(jnp.append(first, 0.0))
-    whole = jnp.pad(first, (0, hidden))
-    start = (whole, jnp.zeros(()), controller.init(planner_key), pending)
+    start = loop.start(first, planner_key, hidden=hidden)
     inputs = (scenario.envs, scenario.observed_envs, noise_keys)
     _, (states, *rest) = jax.lax.scan(step, start, inputs)
     return Episode(jnp.concatenate([first[None], states]), *rest)
@@ -152,38 +135,6 @@ def _spread(levels: Sequence[float | Scalar], states: int) -> State:
     """Return the standard deviation of every state; 0 beyond those that are given."""
     known = jnp.asarray(levels, dtype=float)[:states]
     return jnp.zeros(states).at[: len(known)].set(known)
-
-
-def _on_course(
-    info: ControllerInfo,
-    ahead: Any,
-    state: State,
-    lateral: Scalar,
-    size: tuple[float, float] | None,
-    late: Late,
-) -> tuple[ControllerInfo, Scalar]:
-    """Return the info with the true gap to obstacles, and e_y beside the reference [m].
-
-    Args:
-        info: of the controller.
-        ahead: lane and obstacles.
-        state: after the step.
-        lateral: e_y of a controller that has no reference of its own [m].
-        size: length and width of the car [m].
-        late: sensors and actuators.
-    """
-    assert size is not None
-    info = info._replace(gap=car_clearance(ahead[1], state, size=size))
-    if info.lane is None:
-        return info, lateral
-    # The first point is where the car should be now, if nothing is late.
-    return info, _beside(info.lane.reference[late.observed_ago :], state)
-
-
-def _beside(reference: Reference, state: State) -> Scalar:
-    """Return e_y of a state beside the first point of a reference [m]."""
-    curvature = curvature_ahead(reference)[0]
-    return path_coordinates(state, reference[0], curvature)[LATERAL]
 
 
 def _ahead(scenario: Scenario, progress: Scalar, *, dt: float, horizon: int) -> Any:

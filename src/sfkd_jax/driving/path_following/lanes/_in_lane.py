@@ -26,7 +26,7 @@ from sfkd_jax.driving.path_following.lanes._reference import (
     window,
 )
 from sfkd_jax.driving.paths import SPACING, Lap, Path, point_at, project
-from sfkd_jax.info import ControllerInfo, LaneInfo, Reason
+from sfkd_jax.info import Candidates, ControllerInfo, LaneInfo, Reason
 from sfkd_jax.ranges import (
     AtLeastOne,
     NonNegative,
@@ -128,6 +128,8 @@ class InLane(Stateful):
             because a law follows a falling speed that much later.
         better: relative gain at which a reference replaces the committed one.
         trial: number of steps without a claim after an evasion.
+        candidates: number of references that are drawn as the search draws them, to be
+            shown in `info.lane.candidates` beside the ways round; 0 for none.
     """
 
     inner: Controller
@@ -142,6 +144,7 @@ class InLane(Stateful):
     lead: NonNegative = 0.0
     better: NonNegative = 0.01
     trial: AtLeastOne = 20
+    candidates: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
         check_intervals(self)
@@ -223,12 +226,19 @@ class InLane(Stateful):
                 evading=evading,
                 waiting=jnp.any(~judged.curve.reached & (situation.road.wanted > 0.0)),
                 reversing=jnp.asarray(False),
+                candidates=self._shown(situation, state.planner),
             ),
         )
         wait = jnp.where(due, self.period, state.wait) - 1
         started = state.started | all_finite(observation)
         after = LaneState(inner, planner, committed, progress, wait, started, doubt)
         return control, after, info
+
+    def _shown(self, situation: Situation, planner: Any) -> Candidates | None:
+        """Return candidates of a search, from its state before; None for none."""
+        if not self.candidates:
+            return None
+        return self.manoeuvres.candidates(situation, planner, self.candidates)
 
     def _window(
         self, path: Path, situation: Situation, committed: Committed, judged: Judged

@@ -29,6 +29,7 @@ from sfkd_jax.driving.path_following.lanes._reference import (
     speed_profile,
 )
 from sfkd_jax.driving.paths import quintic
+from sfkd_jax.info import Candidates
 from sfkd_jax.ranges import NonNegative, Positive
 from sfkd_jax.types import Control, Params, Scalar
 
@@ -52,6 +53,8 @@ FAR = 30.0
 """Largest change of a length [m], and of a speed [m/s], that is searched; of a car."""
 SLOWER = (0.0, -2.0, -4.0)
 """Changes of the speed at which obstacles are passed; of a car [m/s]."""
+SHOWN_STREAM = 1
+"""Number that is folded into the key of a search for the candidates that are shown."""
 BRAKING = (0.0, 0.4, 0.8)
 """Shares of the grip left over by the lateral move that evasions brake with."""
 
@@ -210,6 +213,29 @@ class Manoeuvres:
         ways = [pass_both(*way) for way in product(sides, sides, speeds)]
         ways += [pass_second(*way) for way in product(sides, speeds)]
         return jnp.stack(ways)
+
+    def candidates(self, situation: Situation, planner: Any, count: int) -> Candidates:
+        """Return references like those that a search from a state compares.
+
+        They are the ways round, and rows drawn from the distribution of the samples.
+
+        Args:
+            situation: of the car.
+            planner: state of the search before it.
+            count: number of rows that are drawn.
+        """
+        # A stream of its own: the search draws with the key itself.
+        key = jax.random.fold_in(jax.random.wrap_key_data(planner.key), SHOWN_STREAM)
+        noise = jax.random.normal(key, (count, planner.plan.shape[1]))
+        drawn = planner.plan + planner.tuning.noise_std * noise
+        rows = jnp.concatenate([drawn, self.ways_round(situation)])
+
+        def candidate(row: Control) -> Candidates:
+            reference = self.reference(situation, row)
+            judged = self.judge(planner.tuning.cost, situation, reference)
+            return Candidates(judged.curve.position, judged.violation <= 0.0)
+
+        return jax.vmap(candidate)(rows)
 
     def _ahead(
         self, situation: Situation
