@@ -76,6 +76,22 @@ def test_what_the_page_of_systems_says_of_the_worst_case():
     assert f"proved, a tube of {cart['bound']:.2f} m" in words
 
 
+def test_what_the_page_of_the_lane_says_of_clearance_and_of_backing_up():
+    rows = pages.read("benchmarks/lane.json")
+    driven = [row for row in rows if row["group"] in ("random", "pedestrian")]
+    in_lane = [row for row in driven if row["system"] == "lane"]
+    assert sum(row["clearance_below_claim"] for row in in_lane) == 4
+    assert sum(row["steps"] for row in in_lane) == 180_000
+    page = (results.HOME.parent / "docs" / "lane.md").read_text("utf-8")
+    assert "in 4 steps of the 180,000 of random courses" in " ".join(page.split())
+    stands = {}
+    for row in driven:
+        if row["row"] == "pedestrian, friction 0.9":
+            stands.setdefault(row["system"], []).append(row["stand"] / row["runs"])
+    assert min(stands["lane"]) > 0.85
+    assert max(stands["lane, reversing"]) == 0.0
+
+
 @pytest.mark.parametrize("name", results.BENCHMARKS)
 def test_a_file_has_a_line_a_row_and_every_row_its_episodes(name):
     text = (results.HOME / f"{name}.json").read_text("utf-8")
