@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from sfkd_jax.driving.plants import FRICTION, roles_of
 from sfkd_jax.driving.scenarios import COURSES, Scenario
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
+from sfkd_jax.experiment.duration import available_cores
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.progress import Progress
 from sfkd_jax.rollout import fold, on_host, unfold
@@ -93,7 +93,7 @@ def _over_episodes(
     if jax.default_backend() != "cpu":
         return jax.jit(jax.vmap(run, in_axes=(None, 0, 0)))
     compiled = jax.jit(run)
-    cores = _available_cores()
+    cores = available_cores()
 
     def run_all(params: Params, scenarios: Scenario, keys: Array) -> simulation.Episode:
         count = len(keys)
@@ -120,14 +120,6 @@ def _over_episodes(
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
 
     return run_all
-
-
-def _available_cores() -> int:
-    """Return how many cores this process may use."""
-    # A process may be kept to some cores, as each of a comparison is.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def load_systems(run: Run) -> dict[str, System]:

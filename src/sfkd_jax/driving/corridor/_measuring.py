@@ -34,7 +34,6 @@ from sfkd_jax.driving.certificate import (
     RecordedConditions,
 )
 from sfkd_jax.driving.corridor._alarms import (
-    BATCHES,
     Observed,
     calibrate_innovations,
     innovations,
@@ -50,11 +49,13 @@ from sfkd_jax.driving.corridor._closed_loop import Loop
 from sfkd_jax.driving.corridor._margins import law_margins
 from sfkd_jax.driving.corridor._runs import (
     EXCITATION,
+    LATE_PARTS,
     ROAD_SETTINGS,
     Driver,
     Part,
     drivers_of,
     measure_runs,
+    simulated_steps,
 )
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.driving.drives import Reading
@@ -72,12 +73,6 @@ ALARM_STREAM = 5
 """The same for the test of innovations."""
 LATE_STREAM = 6
 """The same for the corridors of vehicles that are later than stated."""
-
-
-PARTS = 4 + 2 + BATCHES
-"""Parts of the runs: for units, bounds, coverage and S3, and those of the alarms."""
-LATE_PARTS = 3
-"""Parts of the runs that are later than stated: for units, bounds and coverage."""
 
 
 def _counted(progress: Progress, steps: int, driver: Driver) -> Driver:
@@ -162,7 +157,7 @@ def measure_corridor(
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
     of_part = len(DRIVES) * runs * round(duration / loop.plant.dt)
-    total = (PARTS + 2 * LATE_PARTS * len(later)) * of_part + attack_steps
+    total = simulated_steps(loop.plant.dt, runs, duration, attack_steps, later)
     with Progress("steps of the vehicle", total) as progress:
 
         def drivers_of_loop(loop: Loop) -> tuple[Driver, ...]:

@@ -14,11 +14,12 @@ from jaxtyping import Array, Float, Int
 from sfkd_jax.certificate import OutputMetric
 from sfkd_jax.certification import FORMS, radii, residuals
 from sfkd_jax.driving.certificate import Seen
-from sfkd_jax.driving.corridor._alarms import simulate_nominal
+from sfkd_jax.driving.corridor._alarms import BATCHES, simulate_nominal
 from sfkd_jax.driving.corridor._closed_loop import Loop, law_sensors
 from sfkd_jax.driving.drives import Reading, drive_along_path, from_s3
 from sfkd_jax.driving.path_coordinates import LATERAL
 from sfkd_jax.driving.scenarios import DRIVES, DriveClass
+from sfkd_jax.latency import Delays
 from sfkd_jax.schedules import random_switching
 from sfkd_jax.types import BODY, Key, Trajectory
 
@@ -28,8 +29,28 @@ OUTPUTS = ("position", "yaw")
 """Outputs whose distances to the nominal model a corridor bounds: e_y and e_ψ."""
 EXCITATION = ("steering_excitation", "speed_excitation")
 """Settings of the data set that say how ν is drawn."""
+PARTS = 4 + 2 + BATCHES
+"""Parts of the runs: for units, bounds, coverage and S3, and those of the alarms."""
+LATE_PARTS = 3
+"""Parts of the runs that are later than stated: for units, bounds and coverage."""
 Driver: TypeAlias = Callable[[Key], tuple[Trajectory, Reading | None]]
 """key -> runs, and what the law has read on them."""
+
+
+def simulated_steps(
+    dt: float, runs: int, duration: float, attack_steps: int, later: Delays
+) -> int:
+    """Return the number of steps of the vehicle in `measure_corridor`.
+
+    Args:
+        dt: sampling period of the vehicle [s].
+        runs: as of `measure_corridor`.
+        duration: of a run [s].
+        attack_steps: as there.
+        later: as there.
+    """
+    parts = PARTS + 2 * LATE_PARTS * len(later)
+    return parts * len(DRIVES) * runs * round(duration / dt) + attack_steps
 
 
 def drivers_of(

@@ -1,0 +1,95 @@
+"""What the main job does, and about how long that takes on this machine."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from sfkd_jax.driving.corridor import simulated_steps
+from sfkd_jax.experiment.run import Run
+
+PROBE = 0.82
+"""Time of `_probe` on the machine that the constants below are from: one core of two of
+a shared server, `python -m sfkd_jax.train +experiment=s3` [s].
+"""
+COMPILING = 220.0
+"""Time in which all programs are compiled, on one core [s]."""
+SHARED = 0.6
+"""Share of that time that is left on two cores or more."""
+TRAINING_STEP = 0.016
+"""Of a step of the optimiser [s]."""
+VEHICLE_STEP = 1.1e-5
+"""Of a step of the vehicle in the runs of a corridor [s]."""
+CONTROL_STEP = 1e-2
+"""Of a control step with `SAMPLES` samples, on one core [s]."""
+SAMPLES = 1500
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    # A process may be kept to some cores, as each of a comparison is.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def plan_of(run: Run) -> str:
+    """Return what a training with everything after it does, and how long that takes.
+
+    A simulator on the host may be a thousand times slower than the vehicles of this
+    package, so that nothing is said of its time.
+
+    Args:
+        run: whose settings are read; nothing is made.
+    """
+    settings = run.settings
+    evaluation = settings.evaluation
+    steps = settings.training.steps
+    parts = ["data", f"{steps:,} steps of training"]
+    seconds = COMPILING * (SHARED if available_cores() > 1 else 1.0)
+    seconds += TRAINING_STEP * steps
+    if run.source.along_path and run.source.logs is None:
+        corridor = settings.certification.corridor
+        driven = simulated_steps(
+            run.plant.dt,
+            corridor.runs,
+            corridor.duration,
+            corridor.attack_steps,
+            corridor.later,
+        )
+        parts.append(f"a certificate on {driven:,} steps of the vehicle")
+        seconds += VEHICLE_STEP * driven
+    else:
+        parts.append("a certificate")
+    systems = len(evaluation.systems)
+    length = f"{evaluation.episodes} episodes of {evaluation.episode_s:g} s"
+    parts.append(f"{length} of {systems} system{'s' * (systems != 1)}")
+    controls = systems * evaluation.episodes * evaluation.episode_s / run.plant.dt
+    planner = settings.controller.planner_settings
+    samples = getattr(planner, "num_samples", SAMPLES)
+    of_control = CONTROL_STEP * max(samples / SAMPLES, 0.1)
+    seconds += of_control * controls / min(available_cores(), evaluation.episodes)
+    plan = ", ".join(parts)
+    if run.source.has_simulator or jax.default_backend() != "cpu":
+        return plan
+    minutes = seconds * _probe() / PROBE / 60.0
+    return f"{plan}; about {max(round(minutes), 1)} min on this machine"
+
+
+def _probe() -> float:
+    """Return how long a small program takes, to compile and to run [s]."""
+    began = time.perf_counter()
+
+    def step(values: Array, number: Array) -> tuple[Array, Array]:
+        for layer in range(8):
+            turned = jnp.tanh(values @ jnp.full((16, 16), 0.1 + 0.01 * layer))
+            values = turned + jnp.sin(layer * values)
+        return values, jnp.sum(values) + number
+
+    run = jax.jit(lambda start: jax.lax.scan(step, start, jnp.arange(2000)))
+    jax.block_until_ready(run(jnp.ones((16, 16))))
+    return time.perf_counter() - began
