@@ -103,7 +103,7 @@ def write_controller(
         },
         "iree": _write_modules(folder, modules) or None,
         "iree_flags": list(iree_flags) if iree else None,
-        "proof": _write(folder / DOCUMENT, proof) if proof else None,
+        "proof": _write_proof(folder, proof) if proof else None,
         **saved._asdict(),
         **trained.interface,
         "places": places,
@@ -112,10 +112,7 @@ def write_controller(
         "settings": trained.settings,
         "versions": store.versions(),
     }
-    here = resources.files("sfkd_jax.export")
-    store.write_bytes(folder / SCRIPT, here.joinpath(f"_{SCRIPT}").read_bytes())
-    if proof:
-        store.write_bytes(folder / CHECKER, here.joinpath(CHECKER).read_bytes())
+    store.write_bytes(folder / SCRIPT, _source(f"_{SCRIPT}"))
     # Last: a folder with a manifest is whole.
     manifest["sha256"] = store.sha256(manifest)
     store.write_json(folder / MANIFEST, manifest)
@@ -160,6 +157,17 @@ def _write_modules(folder: Path, modules: Mapping[str, bytes]) -> dict[str, Any]
         name: _write(folder / f"{FILES[name]}.vmfb", module)
         for name, module in modules.items()
     }
+
+
+def _write_proof(folder: Path, proof: bytes) -> dict[str, Any]:
+    """Write a proof with the program that checks it, and return its entry."""
+    store.write_bytes(folder / CHECKER, _source(CHECKER))
+    return _write(folder / DOCUMENT, proof)
+
+
+def _source(name: str) -> bytes:
+    """Return a file of this package that an export has as it is."""
+    return resources.files("sfkd_jax.export").joinpath(name).read_bytes()
 
 
 def _write(path: Path, content: bytes) -> dict[str, Any]:

@@ -249,11 +249,11 @@ static const char *refusal(const proof *about, output *claim) {
         ? NULL : "L does not follow from P";
 }
 
-/* Text of a document moves no cursor. */
+/* In ASCII: the text of a document moves no cursor. */
 static void print(const char *before, const output *claim) {
     printf("%s: ", before);
     for (uint32_t k = 0; k < claim->letters; k++)
-        putchar(claim->name[k] < ' ' || claim->name[k] == 127 ? '?' : claim->name[k]);
+        putchar(claim->name[k] < ' ' || claim->name[k] > '~' ? '?' : claim->name[k]);
 }
 
 /* Print alpha and L of every output, or why it is refused; return if it is accepted. */
