@@ -5,6 +5,9 @@ from functools import cache
 
 import numpy as np
 
+from sfkd_jax.certification._claims import readouts
+from sfkd_jax.certification._metric_claims import size_of
+from sfkd_jax.certification._metrics import accepted_metric
 from sfkd_jax.certification._search import prove_claims
 from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.types import BODY_FRAME, Declared, Explicit, Polytope
@@ -50,6 +53,14 @@ TURNED = NETWORK._replace(
     declared=Declared("tanh", "identity", 2),
 )
 """Along a path, and contracting faster in the norm of P = ROOT² than in the 2-norm."""
+UNIT = size_of(ROOT @ ROOT)
+METRIC = ROOT @ ROOT / UNIT
+JOINT = [[np.full(4, (1.2 + 0.1 * k) / UNIT)] for k in range(3)]
+TURNED_METRICS = {
+    name: accepted_metric(TURNED, readouts(TURNED, PATH_FRAME)[name], METRIC, JOINT)
+    for name in ("position", "yaw")
+}
+"""What is proved of its outputs in that norm."""
 
 
 @cache

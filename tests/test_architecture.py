@@ -81,7 +81,8 @@ APPLICATIONS = {
     "policy": PARTS | {"assembly"},
     "export": ROAD
     | {"assembly", "policy", "settings", "store"}
-    | {"certificate", "driving.certificate", "driving.path_following"},
+    | {"certificate", "certification"}
+    | {"driving.certificate", "driving.path_following"},
     "adapters": PLANT | {"assembly", "policy", "systems"},
     "report": PLANT
     | {"assembly", "evaluation", "driving.simulation", "store"}

@@ -225,6 +225,11 @@ def test_in_a_lane_the_road_is_a_window_that_moves_on(tmp_path):
     shapes = {x["name"]: x["shape"] for x in manifest["programs"]["act"]["inputs"]}
     assert (shapes["road"], shapes["position"]) == ((260, 4), (2, 1, 2))
     assert manifest["car_m"] == [4.0, 1.8]
+    # The proof and its checker are in the same folder.
+    proof = (tmp_path / "proof.bin").read_bytes()
+    assert manifest["proof"]["sha256"] == hashlib.sha256(proof).hexdigest()
+    assert bytes.fromhex(manifest["weights_sha256"]) in proof
+    assert "int main" in (tmp_path / "check_proof.c").read_text()
     line = np.zeros((300, 4), np.float32)
     line[:, 0] = 0.5 * np.arange(300) - 5.0
     first = np.array([0, 0, 0, 0, 8])
@@ -322,6 +327,8 @@ def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
 ):
     requested = run(spoiled, "controller.mppi.horizon=4", "export.platforms=[cpu]")
     run_dir = requested.directory
+    for name in ("proof.bin", "check_proof.c"):
+        (run_dir / "export" / name).touch()
     assert (run_dir / "export" / "certificate.json").exists()
     provenance = read(run_dir / "certificate.json", DrivingCertificate).provenance
     refusal = Refusal(reason="alpha is not below 1", provenance=provenance)
@@ -331,7 +338,9 @@ def test_the_controller_of_the_command_is_exported_and_no_refused_certificate(
     manifest = json.loads(Path(printed["manifest"]).read_text())
     assert (manifest["horizon"], manifest["certificate_sha256"]) == (4, None)
     folder = Path(printed["policy"]).parent
-    assert not (folder / "certificate.json").exists()
+    assert manifest["proof"] is None
+    for name in ("certificate.json", "proof.bin", "check_proof.c"):
+        assert not (folder / name).exists()
     horizons = [
         sfkd_jax.load(one).settings["controller"]["mppi"]["horizon"]
         for one in (folder, folder.parent)

@@ -11,6 +11,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import proofs
 import pytest
 from documents import hashed
 from helpers import put, refusal_of
@@ -24,6 +25,7 @@ from sfkd_jax.adapters import GymnasiumShield
 from sfkd_jax.experiment.system_runs import compared, drive_beside_rivals, first_run
 from sfkd_jax.experiment.systems import certify_system
 from sfkd_jax.export import __main__ as exporting
+from sfkd_jax.export import _proof
 from sfkd_jax.info import ControllerInfo, PlanInfo, Reason
 from sfkd_jax.policy import SystemPolicy, is_system, restore_system, save_system
 from sfkd_jax.report.system import COMPARISON, FIRST_RUN, write_system_report
@@ -464,6 +466,20 @@ def test_an_export_repeats_every_step_in_a_process_without_this_package(certifie
     assert again.certificate.tubes == policy.certificate.tubes
     with pytest.raises(ValueError, match=r"export.lane is for vehicles"):
         export.write_controller(policy, folder, lane=(10, 1, 1))
+
+
+@proofs.needs_compiler
+def test_the_proof_of_a_system_is_accepted_in_c(certified, tmp_path):
+    _, policy = certified
+    proof = _proof.exported_proof(policy)
+    program = proofs.compiled(tmp_path)
+    (accepted,), (lines,) = proofs.verdicts(program, [proof], tmp_path)
+    assert accepted
+    assert lines[0] == f"proved about the weights {policy.weights_sha256}"
+    assert lines[1:] == [
+        f"{name}: alpha {claim.alpha:.17g}, L {claim.lipschitz:.17g}"
+        for name, claim in policy.certificate.proof.outputs.items()
+    ]
 
 
 def test_the_page_says_what_the_certificate_says(certified):

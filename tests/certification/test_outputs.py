@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ENV_HIGH, ENV_LOW, TINY, path_space
-from networks import NETWORK, ROOT, TURNED, frame_of
+from networks import METRIC, NETWORK, TURNED, frame_of
+from networks import TURNED_METRICS as HONEST
 
 from sfkd_jax import models
 from sfkd_jax.certificate import OutputMetric
@@ -18,14 +19,8 @@ from sfkd_jax.certificate._reading import read_as
 from sfkd_jax.certification import CertificationRefused
 from sfkd_jax.certification._claims import readouts, rows
 from sfkd_jax.certification._measured import Residuals, residuals, worst_gaps
-from sfkd_jax.certification._metric_claims import (
-    require_output_metric,
-    size_of,
-)
-from sfkd_jax.certification._metrics import (
-    accepted_metric,
-    propose_metric,
-)
+from sfkd_jax.certification._metric_claims import require_output_metric
+from sfkd_jax.certification._metrics import propose_metric
 from sfkd_jax.certification._search import prove_claims
 from sfkd_jax.certification._tubes import radii
 from sfkd_jax.certification._weights import exported
@@ -33,13 +28,6 @@ from sfkd_jax.driving.path_coordinates import PATH_FRAME
 from sfkd_jax.rollout import fold, rollout
 from sfkd_jax.types import Declared, Trajectory
 
-UNIT = size_of(ROOT @ ROOT)
-METRIC = ROOT @ ROOT / UNIT
-JOINT = [[np.full(4, (1.2 + 0.1 * k) / UNIT)] for k in range(3)]
-HONEST = {
-    name: accepted_metric(TURNED, readouts(TURNED, PATH_FRAME)[name], METRIC, JOINT)
-    for name in ("position", "yaw")
-}
 every_output = pytest.mark.parametrize("name", HONEST)
 require = inspect.unwrap(require_output_metric)
 """Past the types, which test runs check."""

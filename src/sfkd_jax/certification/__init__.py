@@ -3,6 +3,7 @@
 from sfkd_jax.certification._attack import (
     CertificateContradicted as CertificateContradicted,
 )
+from sfkd_jax.certification._claims import readouts as readouts
 from sfkd_jax.certification._claims import rows as rows
 from sfkd_jax.certification._core import check_metric as check_metric
 from sfkd_jax.certification._core import check_vertices as check_vertices
@@ -29,5 +30,6 @@ from sfkd_jax.certification._verification import near as near
 from sfkd_jax.certification._verification import verify as verify
 from sfkd_jax.certification._weights import CertificateStale as CertificateStale
 from sfkd_jax.certification._weights import CertificationRefused as CertificationRefused
+from sfkd_jax.certification._weights import exported as exported
 from sfkd_jax.certification._weights import require as require
 from sfkd_jax.certification._weights import well_formed as well_formed

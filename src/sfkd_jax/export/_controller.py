@@ -27,6 +27,7 @@ from sfkd_jax.export._programs import (
     flat_programs,
     key_implementation,
 )
+from sfkd_jax.export._proof import CHECKER, DOCUMENT, exported_proof
 from sfkd_jax.policy import Policy, SystemPolicy
 from sfkd_jax.ranges import MayBeEmpty, Names, Positive
 from sfkd_jax.types import Controller
@@ -83,6 +84,7 @@ def write_controller(
     programs = flat_programs(trained, ahead)
     exported = {name: program.lower(*platforms) for name, program in programs.items()}
     modules = _compile_all_for_iree(programs, iree_flags) if iree else {}
+    proof = exported_proof(trained)
     names = [leaf.name for leaf in programs["act"].inputs]
     places = [] if is_system else [name for name in PLACES if name in names]
     _remove_earlier_export(folder)
@@ -101,6 +103,7 @@ def write_controller(
         },
         "iree": _write_modules(folder, modules) or None,
         "iree_flags": list(iree_flags) if iree else None,
+        "proof": _write_proof(folder, proof) if proof else None,
         **saved._asdict(),
         **trained.interface,
         "places": places,
@@ -109,8 +112,7 @@ def write_controller(
         "settings": trained.settings,
         "versions": store.versions(),
     }
-    script = resources.files("sfkd_jax.export").joinpath(f"_{SCRIPT}").read_bytes()
-    store.write_bytes(folder / SCRIPT, script)
+    store.write_bytes(folder / SCRIPT, _source(f"_{SCRIPT}"))
     # Last: a folder with a manifest is whole.
     manifest["sha256"] = store.sha256(manifest)
     store.write_json(folder / MANIFEST, manifest)
@@ -133,7 +135,7 @@ def _remove_earlier_export(folder: Path) -> None:
     The manifest goes first: a folder without it is no export.
     """
     modules = [f"{file}.vmfb" for file in FILES.values()]
-    for name in (MANIFEST, policy.CERTIFICATE, *modules):
+    for name in (MANIFEST, policy.CERTIFICATE, DOCUMENT, CHECKER, *modules):
         (folder / name).unlink(missing_ok=True)
 
 
@@ -155,6 +157,17 @@ def _write_modules(folder: Path, modules: Mapping[str, bytes]) -> dict[str, Any]
         name: _write(folder / f"{FILES[name]}.vmfb", module)
         for name, module in modules.items()
     }
+
+
+def _write_proof(folder: Path, proof: bytes) -> dict[str, Any]:
+    """Write a proof with the program that checks it, and return its entry."""
+    store.write_bytes(folder / CHECKER, _source(CHECKER))
+    return _write(folder / DOCUMENT, proof)
+
+
+def _source(name: str) -> bytes:
+    """Return a file of this package that an export has as it is."""
+    return resources.files("sfkd_jax.export").joinpath(name).read_bytes()
 
 
 def _write(path: Path, content: bytes) -> dict[str, Any]:
