@@ -16,12 +16,11 @@ class Progress:
     """Work in steps that are counted, with the time that is left.
 
     On a terminal it is a bar of tqdm, if that is installed. Elsewhere, such as in the
-    log of a batch job, every `note` is a line, and there is one at least every `APART`
+    log of a batch job, there is a line for every text, and one at least every `APART`
     seconds.
 
         with Progress("training", 6000) as progress:
-            progress.advance(50)
-            progress.note("loss 1.2")
+            progress.advance(50, "loss 1.2")
     """
 
     def __init__(self, name: str, total: int, done: int = 0) -> None:
@@ -49,20 +48,20 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
 
-    def advance(self, count: int = 1) -> None:
-        """Count steps that were done."""
+    def advance(self, count: int = 1, text: str = "") -> None:
+        """Count steps that were done.
+
+        Args:
+            count: number of steps.
+            text: what is known now, to be shown; "" for nothing new.
+        """
         self._done += count
         if self._bar is not None:
+            if text:
+                self._bar.set_postfix_str(text, refresh=False)
             self._bar.update(count)
-        elif time.monotonic() - self._said >= APART:
-            self._say("")
-
-    def note(self, text: str) -> None:
-        """Say something about the work so far."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(text)
-        else:
-            self._say(f": {text}")
+        elif text or time.monotonic() - self._said >= APART:
+            self._say(f": {text}" if text else "")
 
     def _say(self, text: str) -> None:
         """Print a line with what is done so far, and the time that is left."""

@@ -77,27 +77,24 @@ def test_progress_counts_what_was_done_before_and_says_what_is_left(capfd, monke
     now = 100.0
     monkeypatch.setattr("sfkd_jax.progress.time.monotonic", lambda: now)
     with Progress("training", 4000, 1000) as progress:
-        progress.note("begins")
+        progress.advance(0, "begins")
         now = 129.0
         progress.advance(500)  # no line yet: half a minute has not passed
         now = 130.0
         progress.advance(500)
         now = 160.0
-        progress.advance(1000)
-        progress.note("loss 1")
-    first, second, third, fourth = capfd.readouterr().err.splitlines()
+        progress.advance(1000, "loss 1")
+    first, second, third = capfd.readouterr().err.splitlines()
     assert "training 1,000 / 4,000, ? left: begins" in first
     assert "training 2,000 / 4,000, 1:00 left" in second
     # 2000 steps in a minute.
-    assert "training 3,000 / 4,000, 0:30 left" in third
-    assert "training 3,000 / 4,000, 0:30 left: loss 1" in fourth
+    assert "training 3,000 / 4,000, 0:30 left: loss 1" in third
 
 
 def test_on_a_terminal_progress_is_a_bar(capfd, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     with Progress("training", 4) as progress:
-        progress.advance(2)
-        progress.note("loss 1")
+        progress.advance(2, "loss 1")
         progress.advance(2)
     shown = capfd.readouterr().err
     assert "training: 100%" in shown

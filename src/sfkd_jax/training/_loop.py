@@ -139,10 +139,9 @@ def fit(
             # Before the checkpoint: a resumed run can drop lines, but not add them.
             _append(log, record)
             callback(done, record)
-            progress.advance(log_every)
             if saves:
                 checkpoints.save(done, state, record["validation_loss"])
-                progress.note(_losses(record))
+            progress.advance(log_every, _losses(record) if saves else "")
         best = checkpoints.best_step() or steps
         return checkpoints.restore(best, state).params, best
 
