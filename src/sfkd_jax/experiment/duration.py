@@ -12,9 +12,9 @@ from jaxtyping import Array
 from sfkd_jax.driving.corridor import simulated_steps
 from sfkd_jax.experiment.run import Run
 
-PROBE = 0.82
-"""Time of `_probe` on the machine that the constants below are from: one core of two of
-a shared server, `python -m sfkd_jax.train +experiment=s3` [s].
+PROBE = 0.65
+"""Time of `_probe` on the machine that the constants below are from: two cores of a
+server, on which `python -m sfkd_jax.train +experiment=s3` took 5:16 [s].
 """
 COMPILING = 220.0
 """Time in which all programs are compiled, on one core [s]."""
