@@ -39,7 +39,7 @@ def _show(settings: Settings, shipped: str) -> dict[str, Any]:
     # Before minutes of compiling: the package may be missing, or the port in use.
     with viewer.served(settings.demo.port) as server:
         drive = viewer.live_drive(_load(settings, shipped))
-        store.print_message("compiling the control step: minutes, the first time")
+        store.print_message("compiling the control step, which may take a minute")
         return viewer.show(server, drive, seed=settings.seed, started=_print_address)
 
 

@@ -126,7 +126,7 @@ static const char *read_proof(proof *into, bytes document, size_t length) {
     bytes magic = take(&from, sizeof MAGIC, 1);
     uint32_t k;
     if (magic == NULL || memcmp(magic, MAGIC, sizeof MAGIC) || count(&from) != VERSION)
-        return "it is no proof of this version";
+        return "there is no proof of this version in it";
     into->rank = count(&from);
     into->vertices = count(&from);
     into->layers = count(&from);
