@@ -47,9 +47,9 @@ def screenshot(page_address):
 def main(steps, picture):
     """Drive, draw the page, and return what `viewer.show` does."""
     drive = viewer.live_drive(sfkd_jax.load("kinematic_path"))
-    wishes = drive.first_wishes._replace(env=ENV)
+    user_input = drive.first_input._replace(env=ENV)
     with viewer.served(0) as server:
-        shown = viewer.show(server, drive, wishes=wishes, steps=steps)
+        shown = viewer.show(server, drive, user_input=user_input, steps=steps)
         image = screenshot(shown["address"])
     image.save(picture, optimize=True)
     return shown | {"picture": str(picture)}

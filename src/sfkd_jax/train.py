@@ -11,7 +11,7 @@ from sfkd_jax.driving.certificate import DrivingCertificate
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import stages
 from sfkd_jax.experiment.command import command_line, hydra_command
-from sfkd_jax.experiment.duration import plan_of
+from sfkd_jax.experiment.duration import work_of
 from sfkd_jax.experiment.evaluating import evaluate_run
 from sfkd_jax.experiment.named_system import train_system
 from sfkd_jax.experiment.run import Run
@@ -33,7 +33,7 @@ def main(run: Run) -> dict[str, Any]:
     began = time.perf_counter()
     stages.check_settings(run)
     if run.settings.evaluation.systems:
-        store.print_message(f"{run.settings.name}: {plan_of(run)}")
+        store.print_message(f"{run.settings.name}: {work_of(run)}")
     with store.locked(run.directory):
         summary = _run_stages(run)
     summary["seconds"] = time.perf_counter() - began

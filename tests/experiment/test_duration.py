@@ -18,11 +18,11 @@ def one_machine(monkeypatch):
 
 
 def minutes(*words):
-    return int(re.search(r"about (\d+) min", duration.plan_of(run(*words)))[1])
+    return int(re.search(r"about (\d+) min", duration.work_of(run(*words)))[1])
 
 
 def test_the_main_job_says_what_it_does():
-    assert duration.plan_of(run("+experiment=s3")).startswith(
+    assert duration.work_of(run("+experiment=s3")).startswith(
         "data, 4,000 steps of training, a certificate on 4,520,000 steps of the "
         "vehicle, 8 episodes of 60 s of 3 systems; about "
     )

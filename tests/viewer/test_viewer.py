@@ -30,11 +30,11 @@ def start(drive):
     return drive.start(jax.random.key(0))
 
 
-def steps(drive, state, wishes, count):
-    """The moments of some control steps with the same wishes, and the state after."""
+def steps(drive, state, user_input, count):
+    """The moments of some control steps with the same user input, and the state after."""
     moments = []
     for _ in range(count):
-        state, moment = drive.step(state, wishes)
+        state, moment = drive.step(state, user_input)
         moments.append(moment)
     return state, moments
 
@@ -47,7 +47,7 @@ def dragged(drive, state, ahead, aside):
 
 
 def test_what_is_drawn_is_where_the_car_is_and_inside_its_corridor(drive, start):
-    _, moments = steps(drive, start, drive.first_wishes, 12)
+    _, moments = steps(drive, start, drive.first_input, 12)
     for moment in moments:
         body, *windows = moment.scene.car
         x, y, yaw = moment.pose
@@ -70,7 +70,7 @@ def test_what_is_drawn_is_where_the_car_is_and_inside_its_corridor(drive, start)
 
 
 def test_the_road_passes_below_a_camera_that_stands(drive, start):
-    state, moments = steps(drive, start, drive.first_wishes, 12)
+    state, moments = steps(drive, start, drive.first_input, 12)
     centre = point_at(drive.lane.path, state.loop.progress)
     np.testing.assert_allclose(moments[-1].centre, centre[:3], atol=1e-4)
     assert moments[-1].candidates.shape[0] == len(moments[-1].admissible)
@@ -78,9 +78,9 @@ def test_the_road_passes_below_a_camera_that_stands(drive, start):
 
 
 def test_admissible_candidates_keep_clear_of_obstacles_and_others_do_not(drive, start):
-    _, moments = steps(drive, start, drive.first_wishes, 40)
+    _, moments = steps(drive, start, drive.first_input, 40)
     moment = moments[-1]
-    middles = drive.first_wishes.obstacles[:, :, None]
+    middles = drive.first_input.obstacles[:, :, None]
     gaps = np.hypot(*np.moveaxis(moment.candidates[:, None] - middles, 2, 0))
     nearest = gaps.min(axis=(1, 2))
     # A circle of radius 0.8 m, half the width of the car, and the corridor.
@@ -92,10 +92,10 @@ def test_admissible_candidates_keep_clear_of_obstacles_and_others_do_not(drive, 
 
 @pytest.mark.parametrize("aside", [0.0, 1.0])
 def test_an_obstacle_that_is_dragged_onto_the_road_is_not_hit(drive, start, aside):
-    wishes = drive.first_wishes._replace(obstacles=FAR)
-    state, _ = steps(drive, start, wishes, 10)
-    wishes = wishes._replace(obstacles=dragged(drive, state, 40.0, aside))
-    state, moments = steps(drive, state, wishes, 60)
+    user_input = drive.first_input._replace(obstacles=FAR)
+    state, _ = steps(drive, start, user_input, 10)
+    user_input = user_input._replace(obstacles=dragged(drive, state, 40.0, aside))
+    state, moments = steps(drive, state, user_input, 60)
     assert state.nearest > 0.1
     offsets = [np.hypot(*(m.pose - m.centre)[:2]) for m in moments]
     # It has gone round, or it stands.
@@ -104,15 +104,15 @@ def test_an_obstacle_that_is_dragged_onto_the_road_is_not_hit(drive, start, asid
 
 
 def test_a_wall_across_the_road_stops_the_car_until_it_is_dragged_away(drive, start):
-    wishes = drive.first_wishes._replace(obstacles=FAR)
-    state, _ = steps(drive, start, wishes, 5)
+    user_input = drive.first_input._replace(obstacles=FAR)
+    state, _ = steps(drive, start, user_input, 5)
     along = state.loop.progress + jnp.full(6, 45.0)
     wall = np.asarray(beside(drive.lane.path, along, jnp.linspace(-5.0, 5.0, 6)))
-    state, moments = steps(drive, state, wishes._replace(obstacles=wall), 90)
+    state, moments = steps(drive, state, user_input._replace(obstacles=wall), 90)
     assert state.nearest > 0.0
     assert moments[-1].speed < 0.1
     assert moments[-1].braking
-    _, moments = steps(drive, state, wishes, 40)
+    _, moments = steps(drive, state, user_input, 40)
     assert moments[-1].speed > 3.0
 
 
@@ -148,7 +148,7 @@ def test_the_page_is_served_while_the_car_drives(drive, capsys):
         assert shown("/world/corridor").visible
         assert shown("/world/road").color != shown("/world/ground").color
         place = shown("/world/obstacle_5").position[:2]
-        np.testing.assert_allclose(place, drive.first_wishes.obstacles[5], atol=1e-3)
+        np.testing.assert_allclose(place, drive.first_input.obstacles[5], atol=1e-3)
         assert not shown("/wind").visible
     assert document["steps"] == 3
     assert 0.0 < document["max_deviation_m"] < 0.3
@@ -166,9 +166,9 @@ def test_a_paused_car_waits_and_a_restarted_one_begins_anew(drive):
     def pause(address, panel):
         del address
         panels.append(panel)
-        panel.turn()
+        panel.toggle_pause()
         assert panel.pause.label == "Go on"
-        threading.Timer(1.0, panel.turn).start()
+        threading.Timer(1.0, panel.toggle_pause).start()
 
     def restart(address, panel):
         del address
@@ -189,14 +189,14 @@ def test_a_paused_car_waits_and_a_restarted_one_begins_anew(drive):
 
 def test_the_sliders_reach_the_car(drive, start):
     with viewer.served(0) as server:
-        panel = viewer.Panel(server, drive, drive.first_wishes)
+        panel = viewer.Panel(server, drive, drive.first_input)
         friction, wind = panel.env
         friction.value = 0.3
         wind.value = -8.0
         panel.speed.value = 5.0
-        wishes = panel.wishes(FAR)
-    np.testing.assert_allclose(wishes.env, [0.3, -8.0])
-    state, moments = steps(drive, start, wishes, 30)
+        user_input = panel.user_input(FAR)
+    np.testing.assert_allclose(user_input.env, [0.3, -8.0])
+    state, moments = steps(drive, start, user_input, 30)
     assert moments[-1].speed < 8.0
     assert state.largest < moments[-1].bound
 

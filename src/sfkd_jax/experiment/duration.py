@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 
 import jax
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sfkd_jax.driving.corridor import simulated_steps
+from sfkd_jax.experiment.evaluating import available_cores
 from sfkd_jax.experiment.run import Run
 
 PROBE = 0.65
@@ -29,15 +29,7 @@ CONTROL_STEP = 1e-2
 SAMPLES = 1500
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    # A process may be kept to some cores, as each of a comparison is.
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def plan_of(run: Run) -> str:
+def work_of(run: Run) -> str:
     """Return what a training with everything after it does, and how long that takes.
 
     A simulator on the host may be a thousand times slower than the vehicles of this
@@ -48,36 +40,51 @@ def plan_of(run: Run) -> str:
     """
     settings = run.settings
     evaluation = settings.evaluation
-    steps = settings.training.steps
-    parts = ["data", f"{steps:,} steps of training"]
-    seconds = COMPILING * (SHARED if available_cores() > 1 else 1.0)
-    seconds += TRAINING_STEP * steps
-    if run.source.along_path and run.source.logs is None:
-        corridor = settings.certification.corridor
-        driven = simulated_steps(
-            run.plant.dt,
-            corridor.runs,
-            corridor.duration,
-            corridor.attack_steps,
-            corridor.later,
-        )
-        parts.append(f"a certificate on {driven:,} steps of the vehicle")
-        seconds += VEHICLE_STEP * driven
-    else:
-        parts.append("a certificate")
-    systems = len(evaluation.systems)
-    length = f"{evaluation.episodes} episodes of {evaluation.episode_s:g} s"
-    parts.append(f"{length} of {systems} system{'s' * (systems != 1)}")
-    controls = systems * evaluation.episodes * evaluation.episode_s / run.plant.dt
-    planner = settings.controller.planner_settings
-    samples = getattr(planner, "num_samples", SAMPLES)
-    of_control = CONTROL_STEP * max(samples / SAMPLES, 0.1)
-    seconds += of_control * controls / min(available_cores(), evaluation.episodes)
-    plan = ", ".join(parts)
+    parts = ["data", f"{settings.training.steps:,} steps of training"]
+    driven = _corridor_steps(run)
+    on_runs = f" on {driven:,} steps of the vehicle" if driven else ""
+    parts.append(f"a certificate{on_runs}")
+    if run.plant.simulated:
+        systems = len(evaluation.systems)
+        length = f"{evaluation.episodes} episodes of {evaluation.episode_s:g} s"
+        parts.append(f"{length} of {systems} system{'s' * (systems != 1)}")
+    work = ", ".join(parts)
     if run.source.has_simulator or jax.default_backend() != "cpu":
-        return plan
-    minutes = seconds * _probe() / PROBE / 60.0
-    return f"{plan}; about {max(round(minutes), 1)} min on this machine"
+        return work
+    minutes = _seconds(run) * _probe() / PROBE / 60.0
+    return f"{work}; about {max(round(minutes), 1)} min on this machine"
+
+
+def _corridor_steps(run: Run) -> int:
+    """Return the number of steps of the vehicle for the corridor; 0 without one."""
+    # Logs have no plant to drive.
+    if not run.source.along_path or run.source.logs is not None:
+        return 0
+    corridor = run.settings.certification.corridor
+    return simulated_steps(
+        run.plant.dt,
+        corridor.runs,
+        corridor.duration,
+        corridor.attack_steps,
+        corridor.later,
+    )
+
+
+def _seconds(run: Run) -> float:
+    """Return how long the work of a run takes, on a machine as fast as `PROBE` [s]."""
+    settings = run.settings
+    evaluation = settings.evaluation
+    cores = available_cores()
+    seconds = COMPILING * (SHARED if cores > 1 else 1.0)
+    seconds += TRAINING_STEP * settings.training.steps
+    seconds += VEHICLE_STEP * _corridor_steps(run)
+    if run.plant.simulated:
+        samples = getattr(settings.controller.planner_settings, "num_samples", SAMPLES)
+        of_step = CONTROL_STEP * max(samples / SAMPLES, 0.1)
+        steps = evaluation.episodes * evaluation.episode_s / run.plant.dt
+        together = min(cores, evaluation.episodes)
+        seconds += of_step * steps * len(evaluation.systems) / together
+    return seconds
 
 
 def _probe() -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +22,6 @@ from sfkd_jax.driving.plants import FRICTION, roles_of
 from sfkd_jax.driving.scenarios import COURSES, Scenario
 from sfkd_jax.driving.simulation.metrics import Row
 from sfkd_jax.experiment import run_directory
-from sfkd_jax.experiment.duration import available_cores
 from sfkd_jax.experiment.run import Run
 from sfkd_jax.progress import Progress
 from sfkd_jax.rollout import fold, on_host, unfold
@@ -120,6 +120,14 @@ def _over_episodes(
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
 
     return run_all
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    # A process may be kept to some cores, as each of a comparison is.
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def load_systems(run: Run) -> dict[str, System]:

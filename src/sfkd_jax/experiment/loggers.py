@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,17 +27,11 @@ def logger(
         ValueError: there is no such logger, or its library is not installed.
     """
     if name is None:
-        return _nobody()
+        return nullcontext(no_callback)
     if name not in LOGGERS:
         known = ", ".join(LOGGERS)
         raise ValueError(f"training.logger must be one of {known}, got {name!r}")
     return LOGGERS[name](directory / FOLDER, settings)
-
-
-@contextmanager
-def _nobody() -> Iterator[Callback]:
-    """Log nothing."""
-    yield no_callback
 
 
 @contextmanager

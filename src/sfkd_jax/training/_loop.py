@@ -118,16 +118,16 @@ def fit(
     directory = Path(directory)
     log = directory / LOG
     # Closed after an error as well: the caller may open the directory again to resume.
-    with ExitStack() as until_the_end:
+    with ExitStack() as stack:
         kept = closing(Checkpoints(directory / "checkpoints"))
-        checkpoints = until_the_end.enter_context(kept)
+        checkpoints = stack.enter_context(kept)
         _claim(directory, training, first_loss, checkpoints.latest_step())
         state = checkpoints.resume(begin(init_key))
         start = int(state.step)
         _drop_lines_after(log, start)
         began = time.perf_counter()
         advance = _chunk(loss, transform, schedule, draw, length=log_every)
-        progress = until_the_end.enter_context(Progress("training", steps, start))
+        progress = stack.enter_context(Progress("training", steps, start))
         for done in range(start + log_every, steps + 1, log_every):
             state, means = advance(state, data, data_key)
             record = {name: float(value) for name, value in means.items()}

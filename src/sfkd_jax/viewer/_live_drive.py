@@ -48,8 +48,8 @@ CANDIDATES = 24
 """References that are drawn to be shown."""
 
 
-class Wishes(NamedTuple):
-    """What the person at the browser sets.
+class UserInput(NamedTuple):
+    """What the user sets in the browser.
 
     Attributes:
         obstacles: where the obstacles are [m], (obstacle, 2).
@@ -147,13 +147,13 @@ class LiveDrive:
         return _conditions(self.policy).speed
 
     @property
-    def first_wishes(self) -> Wishes:
+    def first_input(self) -> UserInput:
         """Obstacles along the road, the middle of the box of e, and the usual speed."""
         count = len(ASIDE)
         # The first one is half of the distance of two ahead of the start.
         along = self.lane.path.length * (jnp.arange(count) + 0.5) / count
         _, low, high = self.env_box
-        return Wishes(
+        return UserInput(
             obstacles=np.asarray(beside(self.lane.path, along, jnp.asarray(ASIDE))),
             env=0.5 * (low + high),
             speed=SPEED,
@@ -171,14 +171,16 @@ class LiveDrive:
             followed=np.zeros((0, 4)),
         )
 
-    def step(self, before: LiveState, wishes: Wishes) -> tuple[LiveState, Moment]:
-        """Take one control step in the surroundings that are wished for."""
-        obstacles = circles(jnp.asarray(wishes.obstacles), RADIUS)
+    def step(
+        self, before: LiveState, user_input: UserInput
+    ) -> tuple[LiveState, Moment]:
+        """Take one control step with what the user has set."""
+        obstacles = circles(jnp.asarray(user_input.obstacles), RADIUS)
         loop, key, outcome, centre = self.advance(
             before.loop,
             before.key,
-            jnp.asarray(wishes.env, dtype=float),
-            jnp.asarray(wishes.speed, dtype=float),
+            jnp.asarray(user_input.env, dtype=float),
+            jnp.asarray(user_input.speed, dtype=float),
             obstacles,
         )
         outcome = jax.device_get(outcome)

@@ -18,7 +18,7 @@ from sfkd_jax.driving.lanes import Lane
 from sfkd_jax.report import style
 from sfkd_jax.report.frames import beside, surface_colour
 from sfkd_jax.report.lane_scene import Line, car_at
-from sfkd_jax.viewer._live_drive import RADIUS, Moment, Wishes
+from sfkd_jax.viewer._live_drive import RADIUS, Moment, UserInput
 
 if TYPE_CHECKING:
     import viser
@@ -69,13 +69,15 @@ class Nodes:
         controls: by which obstacles are dragged.
     """
 
-    def __init__(self, server: viser.ViserServer, lane: Lane, wishes: Wishes) -> None:
+    def __init__(
+        self, server: viser.ViserServer, lane: Lane, user_input: UserInput
+    ) -> None:
         """Draw what does not change, and the obstacles.
 
         Args:
             server: of the page.
             lane: the road.
-            wishes: with the first places of the obstacles.
+            user_input: with the first places of the obstacles.
         """
         self.scene = server.scene
         self.drawn: dict[str, Any] = {}
@@ -91,7 +93,7 @@ class Nodes:
         self.surface = self._draw_road(lane)
         self.controls = [
             self._draw_obstacle(number, place)
-            for number, place in enumerate(wishes.obstacles)
+            for number, place in enumerate(user_input.obstacles)
         ]
         self.friction = float("nan")
 
@@ -142,15 +144,15 @@ class Nodes:
         for control, place in zip(self.controls, obstacles, strict=True):
             control.position = (*place, OBSTACLE_HEIGHT)
 
-    def draw(self, moment: Moment, wishes: Wishes) -> None:
+    def draw(self, moment: Moment, user_input: UserInput) -> None:
         """Draw what changes from one control step to the next, but for the car.
 
         Args:
             moment: after the step.
-            wishes: that it was taken with.
+            user_input: that it was taken with.
         """
         scene = moment.scene
-        friction, wind = wishes.env
+        friction, wind = user_input.env
         if friction != self.friction:
             self.friction = friction
             self.surface.color = rgb(surface_colour(friction))

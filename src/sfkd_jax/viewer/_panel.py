@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfkd_jax.report import style
-from sfkd_jax.viewer._live_drive import LiveDrive, LiveState, Moment, Wishes
+from sfkd_jax.viewer._live_drive import LiveDrive, LiveState, Moment, UserInput
 
 if TYPE_CHECKING:
     import viser
@@ -32,14 +32,14 @@ class Panel:
     """
 
     def __init__(
-        self, server: viser.ViserServer, drive: LiveDrive, wishes: Wishes
+        self, server: viser.ViserServer, drive: LiveDrive, user_input: UserInput
     ) -> None:
         """Put everything on the page.
 
         Args:
             server: of the page.
             drive: whose limits the sliders have.
-            wishes: values of the sliders at the start.
+            user_input: values of the sliders at the start.
         """
         self.paused = Event()
         self.restarted = Event()
@@ -47,11 +47,11 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False)
         self.readings = gui.add_markdown("")
         self.pause = gui.add_button("Pause")
-        self.pause.on_click(lambda _: self.turn())
+        self.pause.on_click(lambda _: self.toggle_pause())
         restart = gui.add_button("Restart")
         restart.on_click(lambda _: self.restarted.set())
         names, lowest, highest = drive.env_box
-        rows = zip(names, lowest, highest, wishes.env, strict=True)
+        rows = zip(names, lowest, highest, user_input.env, strict=True)
         with gui.add_folder("Conditions"):
             self.env = [
                 gui.add_slider(name, float(low), float(high), 0.05, float(value))
@@ -59,7 +59,7 @@ class Panel:
             ]
             low, high = drive.speeds
             label = "wanted speed [m/s]"
-            self.speed = gui.add_slider(label, low, high, 0.5, wishes.speed)
+            self.speed = gui.add_slider(label, low, high, 0.5, user_input.speed)
         with gui.add_folder("Legend"):
             gui.add_markdown(
                 "\n".join(
@@ -68,7 +68,7 @@ class Panel:
                 )
             )
 
-    def turn(self) -> None:
+    def toggle_pause(self) -> None:
         """Pause the car, or let it go on."""
         if self.paused.is_set():
             self.paused.clear()
@@ -76,10 +76,10 @@ class Panel:
             self.paused.set()
         self.pause.label = "Go on" if self.paused.is_set() else "Pause"
 
-    def wishes(self, obstacles: np.ndarray) -> Wishes:
+    def user_input(self, obstacles: np.ndarray) -> UserInput:
         """Return what the sliders say, and where the obstacles are [m]."""
         env = np.array([slider.value for slider in self.env])
-        return Wishes(obstacles=obstacles, env=env, speed=float(self.speed.value))
+        return UserInput(obstacles=obstacles, env=env, speed=float(self.speed.value))
 
     def read(self, state: LiveState, moment: Moment) -> None:
         """Show the readings after a control step."""

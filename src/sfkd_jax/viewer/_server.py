@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from sfkd_jax.viewer._live_drive import LiveDrive, Wishes
+from sfkd_jax.viewer._live_drive import LiveDrive, UserInput
 from sfkd_jax.viewer._nodes import Nodes
 from sfkd_jax.viewer._panel import Panel
 
@@ -74,7 +74,7 @@ def show(
     server: viser.ViserServer,
     drive: LiveDrive,
     *,
-    wishes: Wishes | None = None,
+    user_input: UserInput | None = None,
     steps: int | None = None,
     seed: int = 0,
     started: Callable[[str, Panel], None] | None = None,
@@ -84,7 +84,7 @@ def show(
     Args:
         server: of the page.
         drive: that is shown.
-        wishes: at the start; by default `LiveDrive.first_wishes`.
+        user_input: at the start; by default `LiveDrive.first_input`.
         steps: number of control steps after which it ends; None for no end.
         seed: of the noise of the sensors and of the planner.
         started: called with the address and the panel before the first step.
@@ -93,15 +93,15 @@ def show(
         Address of the page, number of control steps, and since the last restart the
         time [s] and the largest deviation [m].
     """
-    wishes = wishes or drive.first_wishes
-    first = wishes.obstacles
-    nodes = Nodes(server, drive.lane, wishes)
-    panel = Panel(server, drive, wishes)
+    user_input = user_input or drive.first_input
+    first = user_input.obstacles
+    nodes = Nodes(server, drive.lane, user_input)
+    panel = Panel(server, drive, user_input)
     half = drive.policy.vehicle.size.half
     start = drive.start(jax.random.key(seed))
     state = start
     # The first step compiles; the car stays where it is.
-    _, before = drive.step(state, wishes)
+    _, before = drive.step(state, user_input)
     if started is not None:
         started(address(server), panel)
     done = 0
@@ -113,11 +113,11 @@ def show(
                 panel.restarted.clear()
                 nodes.place(first)
                 state = start
-                _, before = drive.step(state, wishes)
-            wishes = panel.wishes(nodes.obstacles())
-            after, moment = drive.step(state, wishes)
+                _, before = drive.step(state, user_input)
+            user_input = panel.user_input(nodes.obstacles())
+            after, moment = drive.step(state, user_input)
             with server.atomic():
-                nodes.draw(moment, wishes)
+                nodes.draw(moment, user_input)
                 panel.read(after, moment)
             for share in np.arange(1, DRAWN + 1) / DRAWN:
                 with server.atomic():

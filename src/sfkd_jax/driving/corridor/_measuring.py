@@ -56,6 +56,7 @@ from sfkd_jax.driving.corridor._runs import (
     drivers_of,
     measure_runs,
     simulated_steps,
+    steps_of_part,
 )
 from sfkd_jax.driving.corridor._worst_runs import WorstRuns, attack_corridor
 from sfkd_jax.driving.drives import Reading
@@ -156,7 +157,7 @@ def measure_corridor(
     # Streams of their own: runs of the data set must not reappear in its certificate.
     stream = partial(jax.random.fold_in, jax.random.key(data["seed"]))
     *run_keys, sensor_key, attack_key = jax.random.split(stream(STREAM), 6)
-    of_part = len(DRIVES) * runs * round(duration / loop.plant.dt)
+    of_part = steps_of_part(loop.plant.dt, runs, duration)
     total = simulated_steps(loop.plant.dt, runs, duration, attack_steps, later)
     with Progress("steps of the vehicle", total) as progress:
 

@@ -37,6 +37,17 @@ Driver: TypeAlias = Callable[[Key], tuple[Trajectory, Reading | None]]
 """key -> runs, and what the law has read on them."""
 
 
+def steps_of_part(dt: float, runs: int, duration: float) -> int:
+    """Return the number of steps of the vehicle in a part of the runs.
+
+    Args:
+        dt: sampling period of the vehicle [s].
+        runs: of every group.
+        duration: of a run [s].
+    """
+    return len(DRIVES) * runs * round(duration / dt)
+
+
 def simulated_steps(
     dt: float, runs: int, duration: float, attack_steps: int, later: Delays
 ) -> int:
@@ -50,7 +61,7 @@ def simulated_steps(
         later: as there.
     """
     parts = PARTS + 2 * LATE_PARTS * len(later)
-    return parts * len(DRIVES) * runs * round(duration / dt) + attack_steps
+    return parts * steps_of_part(dt, runs, duration) + attack_steps
 
 
 def drivers_of(
