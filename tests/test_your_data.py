@@ -79,6 +79,7 @@ def test_logs_become_a_certified_policy_of_a_robot_that_nothing_drives(logs):
     )
     assert document["results"] is None
     assert "not driven" in done.stderr
+    assert "episodes of" not in done.stderr
     errors = json.loads((logs.parent / document["run"] / "open_loop.json").read_text())
     assert set(errors["baselines"]) == {"kinematic_bicycle", "least_squares"}
     fitted = errors["baselines"]["least_squares"]["position_rmse_m"]
